@@ -1,0 +1,53 @@
+"""Finds the Dr.Jit types that belong with an array.
+
+The mathematical modules never name a backend or a Mitsuba variant: they take
+their types from their arguments, so that the same code runs in single precision
+on LLVM and CUDA and, in the tests, in double precision.
+
+Layout convention used throughout the package:
+
+- *per ray* arrays hold one value for each of R rays;
+- *per sample* arrays hold R·S values, ray-major: sample ``s`` of ray ``r`` lies
+  at ``r * S + s``;
+- tensors that enter or leave a network are ``(features, N)``: one column a query.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+
+def upload(array_type: Any, values: Any) -> Any:
+    """Copies a NumPy array into memory of Dr.Jit's own.
+
+    On the CPU Dr.Jit otherwise borrows NumPy's memory, and compiles another kernel where
+    that happens not to be aligned.
+    """
+    result = array_type(np.ascontiguousarray(values))
+    flat = result.array if dr.is_tensor_v(array_type) else result
+    if len(flat) == 0:
+        return result
+    copy = flat + dr.opaque(type(flat), 0)
+    dr.eval(copy)
+    return array_type(copy, shape=result.shape) if dr.is_tensor_v(array_type) else copy
+
+
+def vector3_type(float_type: type) -> Any:
+    """The 3-vector of ``float_type``, e.g. ``drjit.llvm.ad.Array3f``."""
+    suffix = "f64" if dr.type_v(float_type) == dr.VarType.Float64 else "f"
+    return getattr(sys.modules[float_type.__module__], "Array3" + suffix)
+
+
+def gather_vector3(source: Any, index: Any) -> Any:
+    """Gathers the three components of ``source`` at ``index``, as an ``Array3``."""
+    float_type = type(source[0])
+    return vector3_type(float_type)(*(dr.gather(float_type, source[i], index) for i in range(3)))
+
+
+def uint64_type(float_type: type) -> Any:
+    """The 64-bit index array beside ``float_type``."""
+    return dr.uint64_array_t(float_type)

@@ -1,0 +1,43 @@
+"""Chooses where to compute: the GPU where there is one, the CPU otherwise."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import drjit as dr
+
+from .errors import InputError
+
+_BACKENDS = {"cuda_ad_rgb": dr.JitBackend.CUDA, "llvm_ad_rgb": dr.JitBackend.LLVM}
+
+
+def available_variants() -> list[str]:
+    """The supported Mitsuba variants that work on this machine, best first."""
+    return [name for name, backend in _BACKENDS.items() if dr.has_backend(backend)]
+
+
+def choose_variant(requested: str | None = None) -> str:
+    """``requested``, or the best variant of this machine.
+
+    Raises:
+        InputError: if it is not supported, or nothing is.
+    """
+    available = available_variants()
+    if requested is not None and requested not in _BACKENDS:
+        raise InputError(f"variant '{requested}': expected one of {', '.join(_BACKENDS)}")
+    if not available:
+        raise InputError(
+            "no usable backend: expected an NVIDIA GPU, or an LLVM library (version 17 or newer) "
+            "that DRJIT_LIBLLVM_PATH may point at"
+        )
+    if requested is not None and requested not in available:
+        raise InputError(
+            f"variant '{requested}': does not work on this machine, expected {' or '.join(available)}"
+        )
+    return requested or available[0]
+
+
+def array_module(variant: str) -> Any:
+    """The Dr.Jit module with the differentiable array types of a variant."""
+    return importlib.import_module(f"drjit.{variant.split('_')[0]}.ad")

@@ -1,0 +1,100 @@
+"""The ``mi-nerf`` command."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import tyro
+
+from .commands import Command
+from .errors import InputError
+from .training.run import TrainingError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command line; returns the exit status.
+
+    0: success. 1: the work itself failed. 2: bad usage or bad input. 130: interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        command = _parse(arguments)
+        command.run(_process_start())
+    except InputError as error:
+        return _fail(str(error), 2)
+    except TrainingError as error:
+        return _fail(str(error), 1)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{where}{error.strerror or error}", 1)
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    return 0
+
+
+def _parse(arguments: list[str]) -> Any:
+    """Parses arguments; usage errors become an InputError of one line."""
+    if not arguments:
+        arguments = ["--help"]
+    message = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(message):
+            return tyro.cli(
+                Command,  # type: ignore[arg-type]
+                prog="mi-nerf",
+                description="Neural radiance fields in Mitsuba 3.",
+                args=_spread_lists(arguments),
+                config=(tyro.conf.DisallowNone,),
+            )
+    except SystemExit as stop:
+        if stop.code in (0, None):
+            raise
+        raise InputError(_one_line(message.getvalue())) from None
+
+
+def _spread_lists(arguments: list[str]) -> list[str]:
+    """Turns ``--set a=1 b=2`` into ``--set a=1 --set b=2``; both may be written."""
+    result: list[str] = []
+    inside = False
+    for argument in arguments:
+        if inside and not argument.startswith("-") and result[-1] != "--set":
+            result.append("--set")
+        inside = argument == "--set" or (inside and not argument.startswith("-"))
+        result.append(argument)
+    return result
+
+
+def _one_line(text: str) -> str:
+    """The message in tyro's box, without the box and the colours."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    text = re.sub(r"[─│╭╮╰╯┌┐└┘|]+", " ", text)
+    words = " ".join(text.split())
+    return words.removeprefix("Parsing error ").removeprefix("Unrecognized options ").strip()
+
+
+def _fail(message: str, status: int) -> int:
+    print("mi-nerf: " + " ".join(message.split()), file=sys.stderr)
+    return status
+
+
+def _process_start() -> float:
+    """When this process began, on the clock of ``time.monotonic()``."""
+    now = time.monotonic()
+    try:
+        with open("/proc/self/stat") as file:
+            ticks = int(file.read().rpartition(")")[2].split()[19])
+        age = time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
+        return now - age
+    except (OSError, ValueError, AttributeError):  # not Linux
+        return now
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,300 @@
+"""The sub-commands of ``mi-nerf``: their options, and what they call."""
+
+from __future__ import annotations
+
+import inspect
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+
+from tqdm.auto import tqdm
+from tyro.conf import Positional, UseAppendAction, arg, subcommand
+
+from . import info
+from .backend import choose_variant
+from .demo import run_demo
+from .errors import InputError
+from .evaluation import evaluate
+from .files import make_folder, write_json
+from .rendering import check_output, run_frames, scene_frames, write_frames
+from .target import open_target
+from .training import run as training
+from .training.config import with_settings
+from .training.presets import preset
+
+Variant = Annotated[
+    str | None, arg(help="Mitsuba variant; default: CUDA where it works, LLVM otherwise.")
+]
+
+
+@dataclass(frozen=True)
+class Train:
+    """Trains a radiance field on a dataset of posed images.
+
+    Examples:
+
+    mi-nerf train lego/ --out runs/lego
+
+    mi-nerf train lego/ --out runs/quick --downscale 2 --max-seconds 120
+
+    mi-nerf train lego/ --out runs/wide --set network.width=128 optimizer.lr=5e-3
+
+    mi-nerf train lego/ --out runs/lego --resume
+    """
+
+    data: Positional[Path]
+    """Folder of a dataset (transforms_train.json and images)."""
+    out: Path
+    """Folder of the run; created."""
+    preset: str = "nerf"
+    """Starting point of all settings: nerf or paper."""
+    max_seconds: float | None = None
+    """Stop after so many seconds of wall-clock time (default 600 if --steps is not given)."""
+    steps: int | None = None
+    """Stop after so many steps."""
+    downscale: int = 1
+    """Average images over blocks of K×K pixels."""
+    seed: int = 0
+    """Seed of initial weights, rays and samples."""
+    resume: bool = False
+    """Go on with the run in --out, with its own settings."""
+    set: UseAppendAction[tuple[str, ...]] = ()
+    """Change any setting: key=value, e.g. network.width=128; repeatable."""
+    variant: Variant = None
+
+    def run(self, started: float) -> None:
+        """Trains."""
+        config = preset(self.preset)
+        config = replace(config, seed=_seed(self.seed), downscale=_positive("downscale", self.downscale))
+        config = with_settings(config, list(self.set))
+        limits = {"steps": self.steps, "max_seconds": self.max_seconds}
+        for name, value in limits.items():
+            if value is not None:
+                config = replace(config, **{name: _positive(name.replace("_", "-"), value)})
+        if not self.resume and config.steps is None and config.max_seconds is None:
+            config = replace(config, max_seconds=600.0)
+        run = training.start(
+            self.data,
+            self.out,
+            config,
+            choose_variant(self.variant),
+            resume=self.resume,
+            started=started,
+        )
+        run.train()
+        trainer = run.trainer
+        print(f"{self.out}: {trainer.step_count} steps in {run.seconds:.0f} s")
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Measures held-out views by the nerf2020 protocol: 8 bits, on white, PSNR and SSIM.
+
+    Examples:
+
+    mi-nerf eval runs/lego
+
+    mi-nerf eval runs/lego --split val --views 10 --json result.json --images pictures/
+
+    mi-nerf eval lego.safetensors --data lego/ --downscale 2
+    """
+
+    target: Positional[Path]
+    """A run folder, or a field file (then with --data)."""
+    data: Path | None = None
+    """Dataset; default: the run's own."""
+    split: str = "test"
+    """Which views."""
+    downscale: int | None = None
+    """Average images over blocks of K×K pixels; default: as the run was trained."""
+    views: int | None = None
+    """Only so many views, evenly spread."""
+    json: Path | None = None
+    """Write the results to this file."""
+    images: Path | None = None
+    """Write the rendered views to this folder."""
+    variant: Variant = None
+
+    def run(self, _started: float) -> None:
+        """Evaluates."""
+        bar = _bar("eval", "view")
+
+        def show(_result: dict[str, Any], total: int) -> None:
+            bar.total = total
+            bar.update()
+
+        if self.json is not None:
+            make_folder(self.json.parent)
+        with bar:
+            record = evaluate(
+                open_target(self.target),
+                choose_variant(self.variant),
+                data=self.data,
+                split=self.split,
+                downscale=self.downscale,
+                views=self.views,
+                images=self.images,
+                on_image=show,
+            )
+        if self.json is not None:
+            write_json(self.json, record)
+        mean = record["mean"]
+        print(
+            f"{record['split']}, {record['views']} views of {record['size'][0]}x"
+            f"{record['size'][1]}: PSNR {_number(mean['psnr'], '.2f')} dB, "
+            f"SSIM {_number(mean['ssim'], '.4f')}, "
+            f"{record['seconds_per_view']:.2f} s and {record['queries_per_ray']:.1f} queries a ray"
+        )
+
+
+@dataclass(frozen=True)
+class Render:
+    """Renders a run along a camera path, or a Mitsuba XML scene.
+
+    Examples:
+
+    mi-nerf render runs/lego -o orbit.mp4
+
+    mi-nerf render runs/lego -o test_views/ --path test
+
+    mi-nerf render scene.xml -o scene.exr --spp 64
+    """
+
+    target: Positional[Path]
+    """A run folder or a Mitsuba XML scene."""
+    out: Annotated[Path, arg(aliases=["-o"])]
+    """An .exr, .png or .mp4 file, or a folder of pictures."""
+    path: Literal["orbit", "spiral", "test"] | None = None
+    """Camera path; default: orbit for runs, the scene's own sensors for XML."""
+    frames: int | None = None
+    """Frames along the path; default: 1 for a picture, 60 otherwise, all for --path test."""
+    size: tuple[int, int] | None = None
+    """Width and height; default: those of the run's images or the scene's film."""
+    spp: int | None = None
+    """Samples a pixel; default: 1 for runs, the scene's own for XML."""
+    variant: Variant = None
+
+    def run(self, _started: float) -> None:
+        """Renders."""
+        for name in ("frames", "spp"):
+            if getattr(self, name) is not None:
+                _positive(name, getattr(self, name))
+        if self.size is not None and min(self.size) < 1:
+            raise InputError(
+                f"--size {self.size[0]} {self.size[1]}: expected two numbers of at least 1"
+            )
+        variant = choose_variant(self.variant)
+        picture = self.out.suffix in (".png", ".exr")
+        check_output(self.out, self.frames or 1)
+        if self.target.suffix == ".xml":
+            frames = 1 if picture else 60
+            count, images = scene_frames(
+                self.target,
+                variant,
+                path=self.path,
+                frames=self.frames or frames,
+                size=self.size,
+                spp=self.spp or 0,
+            )
+        else:
+            path = self.path or "orbit"
+            frames = 1 if picture else (0 if path == "test" else 60)
+            count, images = run_frames(
+                open_target(self.target),
+                variant,
+                path=path,
+                frames=self.frames or frames,
+                size=self.size,
+                spp=self.spp or 1,
+            )
+        with _bar("render", "frame", count) as bar:
+            write_frames(self.out, count, images, on_frame=bar.update)
+        print(f"{self.out}: {count} frame{'s' if count != 1 else ''}")
+
+
+@dataclass(frozen=True)
+class Info:
+    """Says what this machine offers, or what a run, checkpoint, field or dataset holds.
+
+    Examples:
+
+    mi-nerf info
+
+    mi-nerf info runs/lego
+    """
+
+    target: Positional[Path | None] = None
+    """A run folder, a .safetensors file or a dataset folder."""
+
+    def run(self, _started: float) -> None:
+        """Prints a summary."""
+        print(info.system() if self.target is None else info.describe(self.target))
+
+
+@dataclass(frozen=True)
+class Demo:
+    """The whole job on a small scene: path-traces images, trains, evaluates, compares.
+
+    Examples:
+
+    mi-nerf demo
+
+    mi-nerf demo --out /tmp/demo
+    """
+
+    out: Path | None = None
+    """Folder for everything it makes; default: mi-nerf-demo, or the next free such name."""
+    seconds: float = 45.0
+    """Training time."""
+    seed: int = 0
+    """Seed of images and training."""
+    variant: Variant = None
+
+    def run(self, started: float) -> None:
+        """Runs the demo."""
+        run_demo(
+            self.out,
+            choose_variant(self.variant),
+            seconds=_positive("seconds", self.seconds),
+            seed=_seed(self.seed),
+        )
+
+
+def _documented(command: type, name: str) -> Any:
+    """A sub-command whose ``--help`` shows the whole docstring, examples included."""
+    return subcommand(name, description=inspect.getdoc(command))
+
+
+Command = (
+    Annotated[Demo, _documented(Demo, "demo")]
+    | Annotated[Train, _documented(Train, "train")]
+    | Annotated[Eval, _documented(Eval, "eval")]
+    | Annotated[Render, _documented(Render, "render")]
+    | Annotated[Info, _documented(Info, "info")]
+)
+
+
+def _positive(name: str, value: Any) -> Any:
+    if not value > 0:
+        raise InputError(f"--{name} {value}: expected a number above 0")
+    return value
+
+
+def _seed(value: int) -> int:
+    if not 0 <= value < 1 << 31:
+        raise InputError(f"--seed {value}: expected a number from 0 to {(1 << 31) - 1}")
+    return value
+
+
+def _bar(name: str, unit: str, total: int | None = None) -> tqdm[Any]:
+    """A progress bar on a terminal; nothing elsewhere."""
+    return tqdm(desc=name, unit=unit, total=total, disable=not sys.stderr.isatty())
+
+
+def _number(value: float | None, form: str) -> str:
+    return "n/a" if value is None else format(value, form)
+
+
+

@@ -1,0 +1,76 @@
+"""Datasets of posed images.
+
+:func:`load_dataset` recognises the layout of a folder and hands it to the reader
+of that layout, a module of this package.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from ..errors import InputError
+from . import blender
+from .dataset import Box, ColorSpace, Dataset, evenly_spread_indices
+from .images import Progress
+
+__all__ = [
+    "Box",
+    "ColorSpace",
+    "Dataset",
+    "Progress",
+    "available_splits",
+    "evenly_spread_indices",
+    "load_dataset",
+]
+
+
+def load_dataset(
+    path: str | os.PathLike[str],
+    split: str,
+    *,
+    downscale: int = 1,
+    limit: int | None = None,
+    progress: Progress | None = None,
+) -> Dataset:
+    """Reads one split of a dataset into memory.
+
+    Args:
+        path: The dataset's folder, in Blender/NeRF layout
+            (:mod:`mi_nerf.data.blender`).
+        split: Which views, e.g. ``"train"``.
+        downscale: Averages blocks of this many pixels squared, premultiplied. A
+            remainder is cropped at the right and the bottom, and the intrinsics
+            follow.
+        limit: Reads only this many views, the ones that
+            :meth:`Dataset.evenly_spread` would choose of the whole split.
+        progress: Called as ``progress(done, total)`` after each image.
+
+    Raises:
+        InputError: Something about the folder, its files or the arguments is
+            not as expected; the message names it.
+    """
+    folder = _existing_folder(path)
+    return blender.load(folder, split, downscale=downscale, limit=limit, progress=progress)
+
+
+def available_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """The names of a dataset's splits: train, val, test first, then any others.
+
+    Raises:
+        InputError: The folder does not exist or is no dataset.
+    """
+    folder = _existing_folder(path)
+    splits = blender.splits(folder)
+    if not splits:
+        raise InputError(f"{folder}: expected a dataset with transforms_{{train,val,test}}.json")
+    return splits
+
+
+def _existing_folder(path: str | os.PathLike[str]) -> Path:
+    folder = Path(path)
+    if not folder.exists():
+        raise InputError(f"{folder}: no such dataset folder")
+    if not folder.is_dir():
+        raise InputError(f"{folder}: expected a dataset folder, this is a file")
+    return folder

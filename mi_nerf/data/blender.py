@@ -1,0 +1,246 @@
+"""Reader of the layout that Blender exporters, NeRF and many others use.
+
+A folder holds ``transforms_{split}.json`` for each split, and images::
+
+    {
+      "camera_angle_x": 0.69,            horizontal view angle in radians, or
+      "fl_x": 1111.1,                    the focal length in pixels; then perhaps
+                                         "fl_y", "cx", "cy" and the size "w", "h"
+      "frames": [{
+        "file_path": "./train/r_0",      ".png" is appended when it has no
+                                         extension; ".exr" images are linear
+        "transform_matrix": [[...], ...] 4x4 camera-to-world, OpenGL axes
+      }],
+      "near": 2, "far": 6,               optional: z-depths, scene units
+      "aabb": [[x, y, z], [x, y, z]]     optional: the scene's box, min and max
+    }
+
+Further keys are ignored, except those that would change the camera into one that
+this reader does not know: lens distortion and intrinsics that vary with the frame
+are errors. ``"from_mitsuba": true`` (instant-ngp) means Mitsuba's axes.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cameras import Intrinsics, opengl_from_mitsuba
+from ..errors import InputError
+from .dataset import Box, Dataset, evenly_spread_indices
+from .images import Progress, read_images
+
+_IMAGE_SUFFIXES = {".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
+_USUAL_SPLITS = ("train", "val", "test")
+_INTRINSIC_KEYS = ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h")
+_DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+
+# How far the columns of a rotation may be from orthonormal. Files written from
+# float32 are within 1e-6; matrices that hold a scale or a shear are far outside.
+_RIGID_TOLERANCE = 1e-3
+
+
+def splits(folder: Path) -> tuple[str, ...]:
+    """The splits that ``folder`` holds: train, val, test first, then any others."""
+    prefix = "transforms_"
+    found = {file.stem[len(prefix) :] for file in folder.glob(prefix + "*.json")}
+    usual = [name for name in _USUAL_SPLITS if name in found]
+    return (*usual, *sorted(found.difference(usual)))
+
+
+def load(
+    folder: Path,
+    split: str,
+    *,
+    downscale: int = 1,
+    limit: int | None = None,
+    progress: Progress | None = None,
+) -> Dataset:
+    """Reads one split. Arguments and errors as for :func:`mi_nerf.data.load_dataset`."""
+    if downscale < 1 or downscale != int(downscale):
+        raise InputError(f"downscale must be a whole number, 1 or more, got {downscale}")
+    file = folder / f"transforms_{split}.json"
+    meta, frames = _read_json(file)
+    _require_plain_pinhole(file, meta, frames)
+    if limit is not None:
+        frames = [frames[i] for i in evenly_spread_indices(len(frames), limit)]
+
+    poses = np.stack([_pose(file, frame) for frame in frames])
+    near, far, box = _depth_range_and_box(file, meta)
+    paths = [_image_path(file, frame) for frame in frames]
+    images = read_images(paths, downscale, progress)
+    return Dataset(
+        path=folder,
+        split=split,
+        names=_unique_names(folder, paths),
+        images=images.pixels,
+        color_space=images.color_space,
+        has_alpha=images.has_alpha,
+        cam_to_world=opengl_from_mitsuba(poses) if meta.get("from_mitsuba") else poses,
+        intrinsics=_intrinsics(file, meta, images.width, images.height).downscale(downscale),
+        near=near,
+        far=far,
+        box=box,
+    )
+
+
+# ---- The JSON file ---------------------------------------------------------
+
+
+def _read_json(file: Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The file's content and its frames, of which there is at least one."""
+    if not file.is_file():
+        others = ", ".join(splits(file.parent)) or "none"
+        raise InputError(f"{file}: no such file; splits in this folder: {others}")
+    try:
+        meta = json.loads(file.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{file}: expected valid JSON ({error})") from error
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
+        raise InputError(f'{file}: expected an object with a list of "frames"')
+    if not frames:
+        raise InputError(f'{file}: the split is empty, expected at least one of "frames"')
+    for index, frame in enumerate(frames):
+        if not isinstance(frame.get("file_path"), str) or not frame["file_path"]:
+            raise InputError(f'{file}: frame {index}: expected a "file_path"')
+    return meta, frames
+
+
+def _number(file: Path, meta: dict[str, Any], key: str) -> float | None:
+    """``meta[key]`` as a finite number, None where there is no such key."""
+    value = meta.get(key)
+    if value is None:
+        return None
+    # JSON's true and false would pass for numbers in Python, and so may NaN.
+    is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not is_number or not abs(value) <= sys.float_info.max:
+        raise InputError(f'{file}: expected a finite number as "{key}", got {value!r}')
+    return float(value)
+
+
+def _pose(file: Path, frame: dict[str, Any]) -> NDArray[np.float64]:
+    """The frame's camera-to-world matrix, (4, 4), known to be rigid."""
+    where = f'{file}: frame "{frame["file_path"]}"'
+    try:
+        pose = np.asarray(frame.get("transform_matrix"), np.float64)
+    except (TypeError, ValueError, OverflowError):  # ragged, or not numbers
+        pose = np.empty(0)
+    if pose.shape != (4, 4):
+        raise InputError(f'{where}: expected a 4x4 "transform_matrix"')
+    if not np.isfinite(pose).all():
+        raise InputError(f'{where}: "transform_matrix" holds NaN or infinity')
+    rotation, bottom = pose[:3, :3], pose[3]
+    if (
+        np.abs(rotation.T @ rotation - np.eye(3)).max() > _RIGID_TOLERANCE
+        or np.abs(bottom - [0, 0, 0, 1]).max() > _RIGID_TOLERANCE
+        or np.linalg.det(rotation) < 0
+    ):
+        raise InputError(
+            f'{where}: expected a rigid "transform_matrix" '
+            "(a rotation without scale, shear or mirroring, and a translation)"
+        )
+    return pose
+
+
+def _depth_range_and_box(
+    file: Path, meta: dict[str, Any]
+) -> tuple[float | None, float | None, Box | None]:
+    """The optional keys ``near``, ``far`` and ``aabb``."""
+    near, far = _number(file, meta, "near"), _number(file, meta, "far")
+    if near is not None and near < 0:
+        raise InputError(f'{file}: expected "near" of 0 or more, got {near:g}')
+    if far is not None and far <= (near or 0):
+        raise InputError(f'{file}: expected "far" beyond near, got {far:g}')
+    if meta.get("aabb") is None:
+        return near, far, None
+    try:
+        corners = np.asarray(meta["aabb"], np.float64)
+    except (TypeError, ValueError, OverflowError):
+        corners = np.empty(0)
+    in_order = corners.shape == (2, 3) and bool((corners[0] < corners[1]).all())
+    if not in_order or not np.isfinite(corners).all():
+        raise InputError(f'{file}: expected "aabb" as [[x, y, z], [x, y, z]], min below max')
+    (x0, y0, z0), (x1, y1, z1) = corners.tolist()
+    return near, far, ((x0, y0, z0), (x1, y1, z1))
+
+
+# ---- The camera ------------------------------------------------------------
+
+
+def _require_plain_pinhole(
+    file: Path, meta: dict[str, Any], frames: Sequence[dict[str, Any]]
+) -> None:
+    """Refuses cameras that would silently be taken for other ones."""
+    model = meta.get("camera_model", "PINHOLE")
+    if model not in ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV"):
+        raise InputError(f'{file}: expected "camera_model" PINHOLE, got {model!r}')
+    for source in (meta, *frames):
+        for key in _DISTORTION_KEYS:
+            if source.get(key):
+                raise InputError(
+                    f'{file}: expected images without lens distortion, got "{key}" {source[key]}'
+                )
+    for frame in frames:
+        for key in _INTRINSIC_KEYS:
+            if key in frame and frame[key] != meta.get(key):
+                raise InputError(
+                    f'{file}: frame "{frame["file_path"]}": expected one camera for all '
+                    f'frames, got its own "{key}"'
+                )
+
+
+def _intrinsics(file: Path, meta: dict[str, Any], width: int, height: int) -> Intrinsics:
+    """The camera of images of this size; ``fl_x`` wins over ``camera_angle_x``."""
+    numbers = {key: _number(file, meta, key) for key in _INTRINSIC_KEYS}
+    stated = numbers["w"] or width, numbers["h"] or height
+    if stated != (width, height):
+        raise InputError(
+            f"{file}: expected images of {stated[0]:g}x{stated[1]:g}, they are {width}x{height}"
+        )
+    angle, fx, fy = numbers["camera_angle_x"], numbers["fl_x"], numbers["fl_y"]
+    cx, cy = numbers["cx"], numbers["cy"]
+    try:
+        if fx is None:
+            if angle is None:
+                raise InputError('expected "camera_angle_x" or "fl_x"')
+            fx = Intrinsics.from_angle_x(width, height, angle).fx
+        return Intrinsics(
+            width,
+            height,
+            fx,
+            fx if fy is None else fy,
+            0.5 * width if cx is None else cx,
+            0.5 * height if cy is None else cy,
+        )
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+
+
+# ---- The images ------------------------------------------------------------
+
+
+def _image_path(file: Path, frame: dict[str, Any]) -> Path:
+    """Where the frame's image is; names may contain dots, so not every suffix counts."""
+    path = file.parent / str(frame["file_path"])
+    if path.suffix.lower() not in _IMAGE_SUFFIXES:
+        path = path.with_name(path.name + ".png")
+    if not path.is_file():
+        raise InputError(f'{path}: no such image, expected by {file}, "{frame["file_path"]}"')
+    return path
+
+
+def _unique_names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:
+    """File names without extension, with their folder's name where that is ambiguous."""
+    repeated = {stem for stem, count in Counter(path.stem for path in paths).items() if count > 1}
+    return tuple(
+        path.stem if path.stem not in repeated else f"{path.parent.name}_{path.stem}"
+        for path in paths
+    )

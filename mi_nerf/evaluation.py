@@ -1,0 +1,130 @@
+"""The ``nerf2020`` protocol: held-out views, 8 bits, on white, PSNR and SSIM.
+
+Each image is compared on its own and the results are averaged; a PSNR is never taken
+of a mean error.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import imageio.v3 as iio
+import numpy as np
+
+from .backend import array_module
+from .color import linear_to_srgb
+from .data import Dataset, load_dataset
+from .errors import InputError
+from .files import make_folder, replacing
+from .metrics import psnr, ssim, to_8bit
+from .target import Target
+from .views import display_image, render_view
+
+Image = np.ndarray[Any, Any]
+
+
+def evaluate(
+    target: Target,
+    variant: str,
+    *,
+    data: str | Path | None = None,
+    split: str = "test",
+    downscale: int | None = None,
+    views: int | None = None,
+    images: str | Path | None = None,
+    on_image: Callable[[dict[str, Any], int], None] | None = None,
+) -> dict[str, Any]:
+    """Renders held-out views and measures them against the dataset.
+
+    Args:
+        data, downscale: default to those of the run.
+        views: only so many views, evenly spread over the split.
+        images: a folder for the rendered views, as 8-bit PNG on white.
+        on_image: called with each image's result and the number of images.
+
+    Returns:
+        The record that ``mi-nerf eval --json`` writes.
+
+    Raises:
+        InputError: if there is no dataset to compare with, or it cannot be read.
+    """
+    dataset = _held_out(target, data, split, downscale, views)
+    folder = None if images is None else make_folder(images)
+    backend = array_module(variant)
+    field, occupancy = target.contents.build(backend)
+    results, seconds, queries = [], [], 0
+    for k, name in enumerate(dataset.names):
+        start = time.perf_counter()
+        view = render_view(
+            field,
+            dataset.intrinsics,
+            dataset.cam_to_world[k],
+            target.contents.march,
+            backend,
+            occupancy=occupancy,
+        )
+        seconds.append(time.perf_counter() - start)
+        queries += view.queries
+        predicted = to_8bit(display_image(view, field.color_space))
+        result = {"name": name, **_compare(predicted, reference_image(dataset, k))}
+        results.append(result)
+        if folder is not None:
+            with replacing(folder / f"{name}.png") as path:
+                iio.imwrite(path, np.rint(predicted * 255).astype(np.uint8), extension=".png")
+        if on_image is not None:
+            on_image(result, len(dataset))
+    size = dataset.intrinsics
+    return {
+        "protocol": "nerf2020",
+        "split": split,
+        "size": [size.width, size.height],
+        "background": "white",
+        "views": len(dataset),
+        "mean": {key: _mean([r[key] for r in results]) for key in ("psnr", "ssim")},
+        "images": results,
+        # The first view also compiles kernels; the median does not feel it.
+        "seconds_per_view": float(np.median(seconds)),
+        "queries_per_ray": queries / (len(dataset) * size.width * size.height),
+        "train_seconds": target.train_seconds,
+        "parameters": target.contents.config.parameter_count(),
+    }
+
+
+def reference_image(dataset: Dataset, index: int) -> Image:
+    """A dataset's view as the protocol sees it: sRGB, on white, in 8 bits."""
+    image = dataset.subset([index]).composited(1.0)[0].astype(np.float64)
+    return to_8bit(linear_to_srgb(image) if dataset.color_space == "linear" else image)
+
+
+def _held_out(
+    target: Target,
+    data: str | Path | None,
+    split: str,
+    downscale: int | None,
+    views: int | None,
+) -> Dataset:
+    path = Path(data) if data is not None else target.data
+    if path is None:
+        raise InputError(f"{target.path}: a field file knows no dataset, expected --data")
+    if views is not None and views < 1:
+        raise InputError(f"--views {views}: expected at least 1")
+    scale = target.downscale if downscale is None else downscale
+    return load_dataset(path, split, downscale=scale, limit=views)
+
+
+def _compare(predicted: Image, truth: Image) -> dict[str, float | None]:
+    quality = psnr(predicted, truth)
+    likeness = ssim(predicted, truth)
+    return {
+        "psnr": quality if math.isfinite(quality) else None,
+        "ssim": likeness if math.isfinite(likeness) else None,
+    }
+
+
+def _mean(values: list[float | None]) -> float | None:
+    numbers = [v for v in values if v is not None]
+    return float(np.mean(numbers)) if numbers else None

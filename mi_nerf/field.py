@@ -1,0 +1,163 @@
+"""Radiance fields: density from position alone, emission from position and direction."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+
+from . import network
+from .activations import ColorActivation, DensityActivation, apply_activation
+from .arrays import upload, vector3_type
+from .encoding import FourierEncoding
+from .network import NetworkConfig
+
+Corner = tuple[float, float, float]
+ColorSpace = Literal["srgb", "linear"]
+
+
+@runtime_checkable
+class Field(Protocol):
+    """What quadrature, plugins and training need of any radiance field.
+
+    Positions are 3-vectors in the field's own coordinates (scene units), directions
+    are unit 3-vectors of travel along the ray; N of each give N results.
+    """
+
+    lower: Corner  # corners of the box outside which the field is empty
+    upper: Corner
+    color_space: ColorSpace  # in which emission is expressed and composited
+
+    def density(self, p: Any) -> Any:
+        """σ ≥ 0 at N points, in 1/scene unit."""
+
+    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+        """σ and the three channels of the emitted colour at N points along ``d``."""
+
+    def parameters(self) -> Mapping[str, Any]:
+        """Differentiable parameters by name; tensors that may be updated in place."""
+
+
+@dataclass(frozen=True)
+class NeuralFieldConfig:
+    """Everything that describes a Fourier-feature field, apart from its weights."""
+
+    lower: Corner = (-1.0, -1.0, -1.0)  # the box, in scene units
+    upper: Corner = (1.0, 1.0, 1.0)
+    color_space: ColorSpace = "srgb"
+    position: FourierEncoding = field(default_factory=FourierEncoding)
+    direction: FourierEncoding = field(default_factory=lambda: FourierEncoding(frequencies=4))
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    density_activation: DensityActivation = "softplus"
+    density_shift: float = -1.0  # added to the raw density before its activation
+    density_scale: float = 1.0  # 1/scene unit: the density of activation output 1
+    color_activation: ColorActivation = "sigmoid"
+    input_center: Corner = (0.0, 0.0, 0.0)  # the network sees (p − center) · scale
+    input_scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
+            raise ValueError(f"box: lower {self.lower} must lie below upper {self.upper}")
+        for name, value, choices in (
+            ("density_activation", self.density_activation, ("softplus", "relu", "exp")),
+            ("color_activation", self.color_activation, ("sigmoid", "softplus", "exp")),
+            ("color_space", self.color_space, ("srgb", "linear")),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name}={value!r}, expected one of {', '.join(choices)}")
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of the network's parameters."""
+        return self.network.shapes(self.position.size, self.direction.size)
+
+    def parameter_count(self) -> int:
+        """Number of trainable scalars."""
+        return sum(int(np.prod(shape)) for shape in self.shapes().values())
+
+    def in_box(self, lower: Corner, upper: Corner) -> NeuralFieldConfig:
+        """The same model over another box: inputs and densities scale with it.
+
+        The longest side spans [−1, 1], so every axis has the same frequencies, and
+        densities count per half of that side: what the network has to learn does not
+        depend on the unit of the scene.
+        """
+        half = max(b - a for a, b in zip(lower, upper, strict=True)) / 2
+        center = tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True))
+        return dataclasses.replace(
+            self,
+            lower=lower,
+            upper=upper,
+            input_center=center,
+            input_scale=1 / half,
+            density_scale=self.density_scale * self._half_side() / half,
+        )
+
+    def _half_side(self) -> float:
+        return max(b - a for a, b in zip(self.lower, self.upper, strict=True)) / 2
+
+
+class NeuralField:
+    """Fourier features into an MLP (NeRF Sec. 4 and 5.1), behind the Field protocol."""
+
+    def __init__(
+        self,
+        config: NeuralFieldConfig,
+        weights: Mapping[str, np.ndarray[Any, Any]],
+        tensor_type: Any,
+    ) -> None:
+        """Uploads ``weights`` as ``tensor_type`` (such as ``mi.TensorXf``).
+
+        Raises:
+            ValueError: if a tensor is missing, unexpected or of the wrong shape.
+        """
+        self.config = config
+        self.lower, self.upper, self.color_space = config.lower, config.upper, config.color_space
+        shapes = config.shapes()
+        if unknown := sorted(set(weights) - set(shapes)):
+            raise ValueError(f"unexpected tensor '{unknown[0]}' for this architecture")
+        for name, shape in shapes.items():
+            if name not in weights:
+                raise ValueError(f"tensor '{name}' is missing, expected shape {shape}")
+            if weights[name].shape != shape:
+                raise ValueError(f"tensor '{name}' is {weights[name].shape}, expected {shape}")
+        self._weights = {name: upload(tensor_type, weights[name]) for name in shapes}
+
+    @classmethod
+    def create(cls, config: NeuralFieldConfig, seed: int, tensor_type: Any) -> NeuralField:
+        """A field with freshly initialised weights."""
+        return cls(config, network.initial_weights(config.shapes(), seed), tensor_type)
+
+    def parameters(self) -> dict[str, Any]:
+        """The network's tensors by name; assign with ``tensor[:] = …`` or replace the entry."""
+        return self._weights
+
+    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
+        """A copy of all tensors as NumPy arrays."""
+        return {name: np.array(tensor) for name, tensor in self._weights.items()}
+
+    def density(self, p: Any) -> Any:
+        """σ at N points, in 1/scene unit."""
+        return self._density(self._trunk(p))
+
+    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+        """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
+        config = self.config
+        h = self._trunk(p)
+        direction = config.direction(d) if config.network.view_dependent else None
+        raw = network.color_head(config.network, self._weights, h, direction)
+        return self._density(h), [apply_activation(config.color_activation, c) for c in raw]
+
+    def _trunk(self, p: Any) -> Any:
+        config = self.config
+        unit = vector3_type(type(p[0]))(
+            *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
+        )
+        return network.trunk(config.network, self._weights, config.position(unit))
+
+    def _density(self, h: Any) -> Any:
+        config = self.config
+        raw = network.density_head(self._weights, h) + config.density_shift
+        return apply_activation(config.density_activation, raw) * config.density_scale

@@ -1,0 +1,106 @@
+"""Field files: what XML scenes load. Weights, description, occupancy and how to sample."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .encoding import FourierEncoding
+from .errors import InputError
+from .field import NeuralField, NeuralFieldConfig
+from .network import NetworkConfig
+from .occupancy import OccupancyGrid
+from .tensor_file import Arrays, read_tensors, write_tensors
+from .volume import MarchSettings
+
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class FieldFile:
+    """The contents of a field file, on the host."""
+
+    config: NeuralFieldConfig
+    weights: Arrays
+    occupancy: np.ndarray[Any, Any] | None = None  # (X, Y, Z) booleans over the box
+    march: MarchSettings = field(default_factory=MarchSettings)  # sampling that suits the field
+    provenance: dict[str, Any] = field(default_factory=dict)  # free-form, for people
+
+    def build(self, backend: Any) -> tuple[NeuralField, OccupancyGrid | None]:
+        """Uploads the field to a backend (``drjit.llvm.ad``, or ``mitsuba`` with a variant)."""
+        neural = NeuralField(self.config, self.weights, backend.TensorXf)
+        if self.occupancy is None:
+            return neural, None
+        grid = OccupancyGrid(neural.lower, neural.upper, self.occupancy, backend.Float)
+        return neural, grid
+
+
+def save_field(path: str | Path, contents: FieldFile) -> None:
+    """Writes a field file, atomically."""
+    arrays = {f"weights.{name}": array for name, array in contents.weights.items()}
+    if contents.occupancy is not None:
+        arrays["occupancy"] = np.packbits(contents.occupancy)
+    march = {k: getattr(contents.march, k) for k in ("samples", "near", "far")}
+    description = {
+        "field": {"kind": "fourier", **dataclasses.asdict(contents.config)},
+        "density_unit": "1/scene unit",
+        "occupancy_shape": None if contents.occupancy is None else contents.occupancy.shape,
+        "march": march,
+        "provenance": contents.provenance,
+    }
+    write_tensors(path, arrays, kind="field", version=VERSION, description=description)
+
+
+def load_field(path: str | Path) -> FieldFile:
+    """Reads a field file.
+
+    Raises:
+        InputError: if it is missing, damaged, of another version, or its tensors do not
+            fit its description.
+    """
+    arrays, description = read_tensors(path, kind="field", version=VERSION)
+    try:
+        config = _field_config(description["field"])
+        weights = {
+            name.removeprefix("weights."): array
+            for name, array in arrays.items()
+            if name.startswith("weights.")
+        }
+        occupancy = None
+        if description["occupancy_shape"] is not None:
+            shape = tuple(description["occupancy_shape"])
+            bits = np.unpackbits(arrays["occupancy"], count=int(np.prod(shape)))
+            occupancy = bits.astype(bool).reshape(shape)
+        march = MarchSettings(**description["march"])
+        contents = FieldFile(config, weights, occupancy, march, description["provenance"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged field description: {error}") from error
+    _check_shapes(path, contents)
+    return contents
+
+
+def _field_config(data: dict[str, Any]) -> NeuralFieldConfig:
+    values = dict(data)
+    if (kind := values.pop("kind")) != "fourier":
+        raise ValueError(f"field kind '{kind}', expected 'fourier'")
+    for name in ("lower", "upper", "input_center"):
+        values[name] = tuple(values[name])
+    for name in ("position", "direction"):
+        values[name] = FourierEncoding(**values[name])
+    values["network"] = NetworkConfig(**values["network"])
+    return NeuralFieldConfig(**values)
+
+
+def _check_shapes(path: str | Path, contents: FieldFile) -> None:
+    shapes = contents.config.shapes()
+    found = {name: array.shape for name, array in contents.weights.items()}
+    for name in sorted(shapes.keys() | found.keys()):
+        if shapes.get(name) != found.get(name):
+            raise InputError(
+                f"{path}: tensor '{name}' is {found.get(name, 'missing')}, "
+                f"expected {shapes.get(name, 'no such tensor')}"
+            )

@@ -1,0 +1,87 @@
+"""Writing files so that nothing half-written ever lies under its final name."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from .errors import InputError
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """A temporary path beside ``path`` that takes its place if the block succeeds.
+
+    The temporary name keeps the suffix, so writers that choose a format by it work.
+
+    Raises:
+        InputError: if the folder cannot be written to.
+    """
+    target = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(
+            dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
+        )
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror}") from error
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        os.chmod(temporary, 0o666 & ~_umask())
+        os.replace(temporary, target)
+    except OSError as error:
+        raise InputError(f"{target}: cannot be written: {error.strerror}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_json(path: str | os.PathLike[str], data: Any) -> None:
+    """Writes ``data`` as indented JSON."""
+    with replacing(path) as temporary:
+        temporary.write_text(json.dumps(data, indent=2) + "\n")
+
+
+def read_json(path: str | os.PathLike[str], expected: str) -> Any:
+    """Reads a JSON file; ``expected`` says in the error message what it should be.
+
+    Raises:
+        InputError: if it is missing or not JSON.
+    """
+    return _read(Path(path), expected, lambda p: json.loads(p.read_text()))
+
+
+def _read(path: Path, expected: str, load: Callable[[Path], Any]) -> Any:
+    try:
+        return load(path)
+    except FileNotFoundError:
+        raise InputError(f"{path}: not found, expected {expected}") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as {expected}: {error}") from error
+
+
+def make_folder(path: str | os.PathLike[str]) -> Path:
+    """Creates an output folder and its parents, and checks that it can be written to.
+
+    Raises:
+        InputError: if that fails.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
+    return folder
+
+
+def _umask() -> int:
+    value = os.umask(0)
+    os.umask(value)
+    return value

@@ -1,0 +1,128 @@
+"""Summaries for people: the system, runs, field files, checkpoints, datasets."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+
+from . import __version__
+from .backend import available_variants
+from .data import available_splits, load_dataset
+from .errors import InputError
+from .field_file import FieldFile, load_field
+from .tensor_file import read_metadata, read_tensors
+from .training import checkpoint
+from .training.run import CHECKPOINT, CONFIG, FIELD, read_config
+
+
+def system() -> str:
+    """Versions, the compiler, and the variants that work here."""
+    import mitsuba as mi
+
+    variants = available_variants()
+    rows = {
+        "mi_nerf": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "python": platform.python_version(),
+        "cores": str(os.cpu_count()),
+        "LLVM library": os.environ.get("DRJIT_LIBLLVM_PATH", "left to Dr.Jit"),
+        "variants": ", ".join(variants) or "none works on this machine",
+        "default": variants[0] if variants else "none",
+    }
+    return _table(rows)
+
+
+def describe(path: Path) -> str:
+    """What lies at ``path``.
+
+    Raises:
+        InputError: if it is nothing that mi_nerf knows.
+    """
+    if not path.exists():
+        raise InputError(
+            f"{path}: not found, expected a run, a .safetensors file or a dataset folder"
+        )
+    if path.is_dir():
+        return _run(path) if (path / CONFIG).exists() else _dataset(path)
+    kind = read_metadata(path).get("format", "")
+    if kind == "mi_nerf.field":
+        return _table(_field_rows(path, load_field(path)))
+    if kind == "mi_nerf.checkpoint":
+        return _table(_checkpoint_rows(path))
+    raise InputError(f"{path}: format '{kind}', expected a field file or a checkpoint of mi_nerf")
+
+
+def _run(folder: Path) -> str:
+    config, record = read_config(folder)
+    data = record["data"]
+    rows: dict[str, str] = {
+        "run": str(folder),
+        "preset": config.preset,
+        "data": f"{data['path']}, {data['views']} views of {data['size'][0]}x{data['size'][1]}",
+        "variant": record["variant"],
+        "budget": ", ".join(
+            f"{v:g} {n}"
+            for n, v in (("steps", config.steps), ("seconds", config.max_seconds))
+            if v is not None
+        ),
+    }
+    if (folder / CHECKPOINT).exists():
+        rows |= _checkpoint_rows(folder / CHECKPOINT)
+    if (folder / FIELD).exists():
+        rows |= _field_rows(folder / FIELD, load_field(folder / FIELD))
+    return _table(rows)
+
+
+def _checkpoint_rows(path: Path) -> dict[str, str]:
+    _, description = read_tensors(path, kind="checkpoint", version=checkpoint.VERSION)
+    return {
+        "checkpoint": str(path),
+        "step": str(description["step"]),
+        "seconds": f"{description['progress']['seconds']:.0f}",
+        "restarts": str(description["attempt"]),
+    }
+
+
+def _field_rows(path: Path, contents: FieldFile) -> dict[str, str]:
+    config, net = contents.config, contents.config.network
+    march = contents.march
+    filled = contents.occupancy
+    return {
+        "field": str(path),
+        "network": f"{net.depth}x{net.width}, skip {net.skip}, view branch "
+        f"{net.view_depth}x{net.view_width}, {config.parameter_count()} parameters",
+        "encoding": f"L={config.position.frequencies} (position), "
+        f"{config.direction.frequencies} (direction), convention {config.position.convention}",
+        "density": f"{config.density_activation}, scale {config.density_scale:.4g} 1/scene unit",
+        "colour": f"{config.color_activation}, {config.color_space}",
+        "box": f"{_corner(config.lower)} to {_corner(config.upper)}",
+        "sampling": f"{march.samples} strata a ray, near {march.near}, far {march.far}",
+        "occupied": "no grid" if filled is None else f"{filled.mean():.1%} of {filled.shape}",
+    }
+
+
+def _dataset(folder: Path) -> str:
+    rows = {"dataset": str(folder)}
+    for split in available_splits(folder):
+        dataset = load_dataset(folder, split)
+        size = dataset.intrinsics
+        alpha = "RGBA" if dataset.has_alpha else "RGB"
+        rows[split] = (
+            f"{len(dataset)} views of {size.width}x{size.height}, {dataset.color_space} {alpha}, "
+            f"field of view {size.fov_x:.1f} degrees"
+        )
+    return _table(rows)
+
+
+def _corner(v: tuple[float, float, float]) -> str:
+    return "(" + ", ".join(f"{x:.3f}" for x in v) + ")"
+
+
+def _table(rows: dict[str, Any]) -> str:
+    width = max(len(name) for name in rows)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows.items())

@@ -1,0 +1,140 @@
+"""A grid over the box that says where a field may hold anything at all.
+
+Samples in cells marked empty are not evaluated and count as density 0. A cell is only
+marked empty while its optical thickness, as last seen, stays below a threshold: a ray
+that crosses n such cells loses an opacity of about n · threshold at most.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .arrays import upload, vector3_type
+from .field import Corner, Field
+
+# Value of a cell that was never looked at: occupied whatever the threshold.
+_UNSEEN = np.float32(np.finfo(np.float32).max)
+
+
+class OccupancyGrid:
+    """Cells of an axis-aligned box, each with a decaying maximum of its density."""
+
+    def __init__(
+        self, lower: Corner, upper: Corner, cells: np.ndarray[Any, Any], float_type: Any
+    ) -> None:
+        """
+        Args:
+            lower, upper: corners of the box, in scene units.
+            cells: (X, Y, Z) booleans, true where the field may be non-empty. The other
+                cells are taken to be empty for good.
+            float_type: ``Float`` of the backend, e.g. ``mi.Float``.
+        """
+        self.lower, self.upper = lower, upper
+        self.shape = cells.shape
+        self._float, self._uint = float_type, dr.uint32_array_t(float_type)
+        self._candidates = upload(self._uint, np.flatnonzero(cells).astype(np.uint32))
+        self._values = upload(float_type, np.where(cells.ravel(), _UNSEEN, 0))
+        self._hull = dr.mask_t(float_type)(cells.ravel())
+        self._mask = dr.mask_t(float_type)(self._hull)
+        dr.eval(self._mask)
+
+    @property
+    def cell_size(self) -> np.ndarray[Any, Any]:
+        """Edge lengths of a cell, in scene units."""
+        return (np.asarray(self.upper) - np.asarray(self.lower)) / np.asarray(self.shape)
+
+    def mask(self) -> np.ndarray[Any, Any]:
+        """(X, Y, Z) booleans: the cells that are sampled."""
+        return np.array(self._mask).astype(bool).reshape(self.shape)
+
+    def values(self) -> np.ndarray[Any, Any]:
+        """(X, Y, Z) remembered densities, 1/scene unit."""
+        return np.array(self._values).reshape(self.shape)
+
+    def fraction(self) -> float:
+        """Share of the cells that are sampled."""
+        return float(dr.count(self._mask)[0]) / len(self._mask)
+
+    def occupied(self, p: Any) -> Any:
+        """Whether points (in field coordinates) lie in cells that may hold something."""
+        index = self._uint(0)
+        for i, size in enumerate(self.cell_size):
+            last = self.shape[i] - 1
+            cell = dr.floor((p[i] - float(self.lower[i])) * float(1 / size))
+            cell = self._uint(dr.fmin(dr.fmax(cell, 0), float(last)))
+            index = index * self.shape[i] + cell
+        return dr.gather(dr.mask_t(self._float), self._mask, index)
+
+    def refresh(
+        self, field: Field, rng: Any, turn: int, *, queries: int, threshold: float, decay: float
+    ) -> None:
+        """Looks at the field again at one random point in each of ``queries`` cells.
+
+        Half of them take their turn among all cells that are not known to be empty for
+        good, half among those sampled now. A value decays by ``decay`` at every look and
+        never stays below the density just seen; a cell counts as empty once its value
+        times the mean edge length is below ``threshold``.
+
+        Args:
+            rng: a Dr.Jit generator, for the place within each cell.
+            turn: how often the grid has been refreshed before.
+        """
+        half = max(1, queries // 2)
+        sampled = self._uint(dr.compress(self._mask))
+        for pool in (self._candidates, sampled):
+            if len(pool):
+                self._look(field, pool, turn * half, half, rng, decay)
+        thickness = float(np.mean(self.cell_size))
+        dense = self._values >= dr.opaque(self._float, threshold / thickness)
+        self._mask = self._hull & dense
+        dr.eval(self._mask, self._values)
+
+    def restore(self, values: np.ndarray[Any, Any], mask: np.ndarray[Any, Any]) -> None:
+        """Takes up the state of a grid of the same shape.
+
+        Raises:
+            ValueError: if the shape is another.
+        """
+        for array in (values, mask):
+            if array.shape != self.shape:
+                raise ValueError(f"occupancy grid is {array.shape}, expected {self.shape}")
+        self._values = upload(self._float, np.asarray(values, np.float32).ravel())
+        self._mask = dr.mask_t(self._float)(np.asarray(mask, bool).ravel())
+        dr.eval(self._mask)
+
+    def _look(
+        self, field: Field, pool: Any, first: int, count: int, rng: Any, decay: float
+    ) -> None:
+        uint = self._uint
+        turn = dr.arange(uint, count) + dr.opaque(uint, first % len(pool))
+        cell = dr.gather(uint, pool, turn % dr.opaque(uint, len(pool)))
+        rest, where = cell, []
+        for size in reversed(self.shape):
+            where.insert(0, rest % size)
+            rest = rest // size
+        p = vector3_type(self._float)(
+            *(
+                (self._float(w) + rng.random(self._float, count)) * float(s) + float(low)
+                for w, s, low in zip(where, self.cell_size, self.lower, strict=True)
+            )
+        )
+        dr.eval(p, cell)
+        with dr.suspend_grad():
+            density = field.density(p)
+            old = dr.gather(self._float, self._values, cell)
+            old = dr.select(old < float(_UNSEEN), old * decay, 0)
+            # A pool smaller than the batch is gone through more than once.
+            dr.scatter(self._values, old, cell)
+            dr.eval(self._values)  # a store and a reduction fused into one kernel lose the store
+            dr.scatter_reduce(dr.ReduceOp.Max, self._values, density, cell)
+            dr.eval(self._values)
+
+
+def grid_shape(lower: Corner, upper: Corner, resolution: int) -> tuple[int, int, int]:
+    """Nearly cubic cells, ``resolution`` of them along the longest side."""
+    size = np.asarray(upper, float) - np.asarray(lower, float)
+    shape = np.maximum(1, np.rint(resolution * size / size.max())).astype(int)
+    return int(shape[0]), int(shape[1]), int(shape[2])

@@ -1,0 +1,36 @@
+"""The Mitsuba plugins ``nerf`` (integrator) and ``nerfmedium`` (medium).
+
+Plugin classes inherit from classes of the active Mitsuba variant, so the modules
+that define them are imported again whenever the variant changes.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import mitsuba as mi
+
+_MODULES = ("medium", "integrator")
+_loaded_for: str | None = None
+
+
+def register(*_: object) -> None:
+    """Registers the plugins with the active variant; does nothing for scalar ones."""
+    global _loaded_for
+    variant = mi.variant()
+    if variant is None or variant.startswith("scalar") or variant == _loaded_for:
+        return
+    for name in _MODULES:
+        qualified = f"{__name__}.{name}"
+        if qualified in sys.modules:
+            importlib.reload(sys.modules[qualified])
+        else:
+            importlib.import_module(qualified)
+    _loaded_for = variant
+
+
+def register_always() -> None:
+    """Registers now, and again after every change of variant."""
+    mi.detail.add_variant_callback(register)
+    register()

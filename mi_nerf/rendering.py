@@ -1,0 +1,277 @@
+"""Pictures and videos of trained runs and of Mitsuba scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import imageio.v2 as imageio
+import imageio.v3 as iio
+import numpy as np
+
+from .backend import array_module
+from .cameras import Intrinsics
+from .color import linear_to_srgb, srgb_to_linear
+from .data import Dataset, available_splits, load_dataset
+from .errors import InputError
+from .files import make_folder, replacing
+from .images import write_exr
+from .target import Target
+from .trajectory import orbit_like, spiral_like
+from .views import render_view
+
+Image = np.ndarray[Any, Any]
+Path_ = Literal["orbit", "spiral", "test"]
+Frames = Iterator[tuple[str, Image]]  # name and (H, W, 4) linear premultiplied RGBA
+
+PICTURES, VIDEOS = (".png", ".exr"), (".mp4",)
+
+
+def run_frames(
+    target: Target,
+    variant: str,
+    *,
+    path: Path_ = "orbit",
+    frames: int = 1,
+    size: tuple[int, int] | None = None,
+    spp: int = 1,
+) -> tuple[int, Frames]:
+    """Renders a run along a camera path.
+
+    Returns:
+        The number of frames and an iterator over them.
+
+    Raises:
+        InputError: if the run's dataset cannot be read.
+    """
+    if target.data is None:
+        raise InputError(f"{target.path}: a field file knows no cameras, expected a run or an XML")
+    dataset = _cameras(target, path)
+    intrinsics = _resized(dataset.intrinsics, size)
+    if path == "test":
+        poses = dataset.evenly_spread(frames).cam_to_world if frames else dataset.cam_to_world
+    else:
+        poses = (orbit_like if path == "orbit" else spiral_like)(dataset.cam_to_world, frames)
+    backend = array_module(variant)
+    field, occupancy = target.contents.build(backend)
+
+    def generate() -> Frames:
+        for i, pose in enumerate(poses):
+            view = render_view(
+                field,
+                intrinsics,
+                pose,
+                target.contents.march,
+                backend,
+                occupancy=occupancy,
+                spp=spp,
+            )
+            yield f"{path}_{i:03d}", _linear_rgba(view.color, view.opacity, field.color_space)
+
+    return len(poses), generate()
+
+
+def scene_frames(
+    scene_path: str | Path,
+    variant: str,
+    *,
+    path: Path_ | None = None,
+    frames: int = 1,
+    size: tuple[int, int] | None = None,
+    spp: int = 0,
+) -> tuple[int, Frames]:
+    """Renders a Mitsuba scene: all of its sensors, or the first one moved along a path.
+
+    Raises:
+        InputError: if the scene cannot be loaded or has no sensor.
+    """
+    import mitsuba as mi
+
+    mi.set_variant(variant)
+    scene = load_scene(scene_path)
+    sensors = scene.sensors()
+    if not sensors:
+        raise InputError(f"{scene_path}: has no sensor, expected at least one")
+    if size is not None:
+        for sensor in sensors:
+            film = mi.traverse(sensor)
+            film["film.size"] = list(size)
+            film.update()
+
+    def still() -> Frames:
+        for i, sensor in enumerate(sensors):
+            yield f"sensor_{i:03d}", _bitmap_rgba(mi.render(scene, sensor=sensor, spp=spp))
+
+    if path is None:
+        return len(sensors), still()
+    if path == "test":
+        raise InputError(f"{scene_path}: a scene has no test views, expected --path orbit or spiral")
+    return frames, _moving(scene, sensors[0], path, frames, spp)
+
+
+def load_scene(path: str | Path) -> Any:
+    """Loads Mitsuba XML; what Mitsuba says goes into one line.
+
+    Raises:
+        InputError: if the file is missing or Mitsuba refuses it.
+    """
+    import mitsuba as mi
+
+    if not Path(path).is_file():
+        raise InputError(f"{path}: not found, expected a run folder or a Mitsuba XML scene")
+    try:
+        return mi.load_file(str(path))
+    except Exception as error:  # Mitsuba raises RuntimeError for all that can be wrong
+        message = " ".join(str(error).split())
+        raise InputError(f"{path}: Mitsuba cannot load this scene: {message}") from error
+
+
+def write_frames(
+    out: str | Path,
+    count: int,
+    frames: Frames,
+    *,
+    fps: int = 24,
+    on_frame: Callable[[], None] | None = None,
+) -> None:
+    """Writes frames as one picture, a video, or pictures in a folder, by the name of ``out``.
+
+    Pictures keep alpha: ``.exr`` linear and premultiplied, ``.png`` sRGB and straight.
+    Videos are on white.
+
+    Raises:
+        InputError: if the name does not suit the number of frames, or cannot be written.
+    """
+    target = Path(out)
+    check_output(target, count)
+
+    def counted() -> Frames:
+        for item in frames:
+            yield item
+            if on_frame is not None:
+                on_frame()
+
+    if target.suffix in PICTURES:
+        for _, image in counted():
+            write_picture(target, image)
+    elif target.suffix in VIDEOS:
+        _write_video(target, counted(), fps)
+    else:
+        folder = make_folder(target)
+        for name, image in counted():
+            write_picture(folder / f"{name}.png", image)
+
+
+def check_output(target: Path, count: int) -> None:
+    """Refuses output names that cannot hold ``count`` frames."""
+    if target.suffix in PICTURES and count != 1:
+        raise InputError(f"{target}: {count} frames, expected an .mp4 or a folder (or --frames 1)")
+    if target.suffix and target.suffix not in PICTURES + VIDEOS:
+        raise InputError(f"{target}: expected an .exr, .png or .mp4 file or a folder")
+    if target.suffix:
+        make_folder(target.parent)
+
+
+def write_picture(path: Path, image: Image) -> None:
+    """Writes (H, W, 4) linear premultiplied RGBA as ``.exr`` or ``.png``."""
+    with replacing(path) as temporary:
+        if path.suffix == ".exr":
+            write_exr(temporary, image)
+        else:
+            alpha = np.clip(image[..., 3:], 0, 1)
+            straight = image[..., :3] / np.where(alpha > 0, alpha, 1)
+            straight = np.where(alpha > 0, linear_to_srgb(straight), 0)
+            pixels = np.concatenate([np.clip(straight, 0, 1), alpha], axis=-1)
+            iio.imwrite(temporary, np.rint(pixels * 255).astype(np.uint8), extension=".png")
+
+
+def _write_video(target: Path, frames: Frames, fps: int) -> None:
+    with replacing(target) as temporary:
+        writer = imageio.get_writer(temporary, fps=fps, macro_block_size=2, quality=8)
+        with writer:
+            for _, image in frames:
+                straight = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
+                encoded = linear_to_srgb(straight) * image[..., 3:] + 1 - image[..., 3:]
+                writer.append_data(np.rint(np.clip(encoded, 0, 1) * 255).astype(np.uint8))
+
+
+def _cameras(target: Target, path: Path_) -> Dataset:
+    """The views whose cameras a path follows; one image is read for its size."""
+    assert target.data is not None
+    if path != "test":
+        return load_dataset(target.data, "train", downscale=target.downscale)
+    splits = [s for s in available_splits(target.data) if s != "train"]
+    if not splits:
+        raise InputError(f"{target.data}: has no test views, expected --path orbit or spiral")
+    split = "test" if "test" in splits else splits[0]
+    return load_dataset(target.data, split, downscale=target.downscale)
+
+
+def _resized(intrinsics: Intrinsics, size: tuple[int, int] | None) -> Intrinsics:
+    """The same horizontal field of view on a film of another size."""
+    if size is None:
+        return intrinsics
+    if min(size) < 1:
+        raise InputError(f"--size {size[0]} {size[1]}: expected two numbers of at least 1")
+    scale = size[0] / intrinsics.width
+    return replace(
+        intrinsics,
+        width=size[0],
+        height=size[1],
+        fx=intrinsics.fx * scale,
+        fy=intrinsics.fy * scale,
+        cx=intrinsics.cx * scale,
+        cy=intrinsics.cy * size[1] / intrinsics.height,
+    )
+
+
+def _linear_rgba(color: Image, opacity: Image, color_space: str) -> Image:
+    alpha = opacity[..., None]
+    if color_space == "srgb":
+        straight = color / np.where(alpha > 0, alpha, 1)
+        color = np.where(alpha > 0, srgb_to_linear(straight) * alpha, 0)
+    return np.concatenate([color, alpha], axis=-1).astype(np.float32)
+
+
+def _bitmap_rgba(image: Any) -> Image:
+    """The colour channels of a Mitsuba image, opaque where the film has no alpha."""
+    pixels = np.array(image)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    if pixels.shape[-1] < 3:
+        pixels = np.repeat(pixels[..., :1], 3, axis=-1)
+    if pixels.shape[-1] == 3:
+        pixels = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
+    return pixels[..., :4]
+
+
+def _moving(scene: Any, sensor: Any, path: Path_, frames: int, spp: int) -> Frames:
+    """Moves a sensor around the scene's box, at its own distance and height."""
+    import mitsuba as mi
+
+    from .cameras import mitsuba_from_opengl, opengl_from_mitsuba
+
+    parameters = mi.traverse(sensor)
+    start = opengl_from_mitsuba(np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4))
+    center = np.array(scene.bbox().center(), np.float64).ravel()
+    aimed = _aim(start, center)
+    poses = (orbit_like if path == "orbit" else spiral_like)(aimed, frames)
+    for i, pose in enumerate(poses):
+        matrix = mi.ScalarTransform4f(mitsuba_from_opengl(pose))
+        parameters["to_world"] = mi.Transform4f(matrix)
+        parameters.update()
+        yield f"{path}_{i:03d}", _bitmap_rgba(mi.render(scene, sensor=sensor, spp=spp, seed=i))
+
+
+def _aim(pose: Image, center: Image) -> Image:
+    """A ring of cameras like ``pose`` that all look at ``center``."""
+    from .trajectory import orbit
+
+    offset = pose[:3, 3] - center
+    radius = float(np.linalg.norm(offset))
+    strongest = int(np.argmax(np.abs(pose[:3, 1])))
+    up = np.zeros(3)
+    up[strongest] = np.sign(pose[strongest, 1])
+    return orbit(center, up, radius, float(np.clip(offset @ up / radius, -0.95, 0.95)), 8)

@@ -1,0 +1,33 @@
+"""Finds the scenes that come with mi_nerf."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .errors import InputError
+
+_PACKAGE = Path(__file__).parent
+
+
+def scene_folder() -> Path:
+    """``scenes/``: beside the package in a checkout, inside it once installed."""
+    for folder in (_PACKAGE.parent / "scenes", _PACKAGE / "scenes"):
+        if (folder / "spheres.xml").exists():
+            return folder
+    raise InputError(f"{_PACKAGE / 'scenes'}: not found, the installation is incomplete")
+
+
+def find_scene(name: str) -> Path:
+    """The path of a scene given by name, such as ``spheres``, or by path.
+
+    Raises:
+        InputError: if there is neither, with the names there are.
+    """
+    if Path(name).suffix == ".xml":
+        if Path(name).is_file():
+            return Path(name)
+        raise InputError(f"{name}: not found, expected a Mitsuba XML scene")
+    scenes = {p.stem: p for p in sorted(scene_folder().rglob("*.xml"))}
+    if name not in scenes:
+        raise InputError(f"scene '{name}': unknown, expected an .xml file or {', '.join(scenes)}")
+    return scenes[name]

@@ -1,0 +1,73 @@
+"""Named arrays with a JSON description, in safetensors files of a known kind and version.
+
+Nothing here executes code from a file: safetensors holds plain bytes, and the
+description is JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
+
+from .errors import InputError
+from .files import replacing
+
+Arrays = dict[str, "np.ndarray[Any, Any]"]
+
+
+def write_tensors(
+    path: str | Path, arrays: Arrays, *, kind: str, version: int, description: dict[str, Any]
+) -> None:
+    """Writes arrays and a JSON-able description, atomically."""
+    metadata = {
+        "format": f"mi_nerf.{kind}",
+        "version": str(version),
+        "description": json.dumps(description),
+    }
+    with replacing(path) as temporary:
+        save_file({n: np.ascontiguousarray(a) for n, a in arrays.items()}, temporary, metadata)
+
+
+def read_tensors(path: str | Path, *, kind: str, version: int) -> tuple[Arrays, dict[str, Any]]:
+    """Reads what :func:`write_tensors` wrote.
+
+    Raises:
+        InputError: if the file is missing, damaged, of another kind or version.
+    """
+    metadata = read_metadata(path)
+    found, wanted = metadata.get("format", "no format"), f"mi_nerf.{kind}"
+    if found != wanted:
+        raise InputError(f"{path}: holds '{found}', expected '{wanted}'")
+    if metadata.get("version") != str(version):
+        raise InputError(
+            f"{path}: {kind} file of version {metadata.get('version')}, "
+            f"this mi_nerf reads version {version}"
+        )
+    try:
+        with safe_open(path, framework="numpy") as file:
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        return arrays, json.loads(metadata["description"])
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: damaged: {error}") from error
+
+
+def read_metadata(path: str | Path) -> dict[str, str]:
+    """The metadata of any safetensors file.
+
+    Raises:
+        InputError: if the file is missing or not a complete safetensors file.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"{path}: not found, expected a .safetensors file")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            return dict(file.metadata() or {})
+    except (SafetensorError, OSError) as error:
+        raise InputError(
+            f"{path}: not a complete safetensors file (truncated or another format): {error}"
+        ) from error

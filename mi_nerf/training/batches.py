@@ -1,0 +1,80 @@
+"""Random rays from all images, gathered from camera matrices on the fly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..arrays import uint64_type
+from ..cameras import pack_poses, pixel_rays
+from ..data import Dataset
+
+
+@dataclass
+class RayBatch:
+    """R rays and the premultiplied pixels they ought to see."""
+
+    o: Any
+    d: Any  # unit
+    color: list[Any]  # three arrays of R values, premultiplied
+    alpha: Any
+    background: list[Any]  # what to place behind both, one value or R values a channel
+
+
+class RaySource:
+    """Keeps a dataset's pixels and poses on the device and draws random rays."""
+
+    def __init__(self, dataset: Dataset, background: str, float_type: Any) -> None:
+        """``background`` is 'white', 'black' or 'random' (a new colour for every ray)."""
+        self._float, self._uint = float_type, dr.uint32_array_t(float_type)
+        self._intrinsics = dataset.intrinsics
+        self._pixels = float_type(dataset.images.reshape(-1))
+        self._poses = float_type(pack_poses(dataset.cam_to_world))
+        self._background = background
+        self._size = self._intrinsics.width * self._intrinsics.height
+        self._count = len(dataset) * self._size
+
+    def draw(self, rays: int, rng: Any) -> RayBatch:
+        """``rays`` pixels chosen uniformly over all images, through their centres."""
+        pixel = rng.integers(self._uint, rays, high=dr.opaque(self._uint, self._count))
+        camera = pixel // dr.opaque(self._uint, self._size)
+        within = pixel - camera * dr.opaque(self._uint, self._size)
+        width = dr.opaque(self._uint, self._intrinsics.width)
+        row = within // width
+        x, y = self._float(within - row * width) + 0.5, self._float(row) + 0.5
+        o, d = pixel_rays(self._poses, self._intrinsics, camera, x, y)
+        rgba = [dr.gather(self._float, self._pixels, pixel * 4 + i) for i in range(4)]
+        batch = RayBatch(o, d, rgba[:3], rgba[3], self._draw_background(rays, rng))
+        dr.eval(batch.o, batch.d, batch.color, batch.alpha, batch.background)
+        return batch
+
+    def _draw_background(self, rays: int, rng: Any) -> list[Any]:
+        if self._background == "random":
+            return [rng.random(self._float, rays) for _ in range(3)]
+        value = 1.0 if self._background == "white" else 0.0
+        return [dr.opaque(self._float, value) for _ in range(3)]
+
+
+def blank_loss(dataset: Dataset, background: str) -> float:
+    """Mean squared error of a field that has collapsed: empty space, or one even colour.
+
+    Whichever is smaller; a field that has learnt anything stays below a good part of it.
+    """
+    stride = max(1, dataset.images.size // 4_000_000)
+    pixels = dataset.images.reshape(-1, 4)[::stride].astype(np.float64)
+    color, alpha = pixels[:, :3], pixels[:, 3:]
+    if background == "random":  # the mean over all backgrounds, uniform in [0, 1]
+        empty = np.mean(np.square(color - alpha / 2)) + np.mean(np.square(alpha)) / 12
+        return float(empty)
+    behind = 1.0 if background == "white" else 0.0
+    empty = np.mean(np.square(color - alpha * behind))
+    even = np.mean(np.var(color + (1 - alpha) * behind, axis=0))
+    return float(min(empty, even) if empty > 0 else even)
+
+
+def step_rng(float_type: Any, seed: int, step: int) -> Any:
+    """The generator of one training step: all its randomness follows from seed and step."""
+    return dr.rng(seed=dr.opaque(uint64_type(float_type), (seed << 32) + step))

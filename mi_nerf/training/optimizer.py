@@ -1,0 +1,96 @@
+"""Adam (Kingma & Ba 2015) that can decline a step and whose state can be saved.
+
+Dr.Jit's own optimizer would serve, but a step with a non-finite gradient must leave
+parameters *and* moments untouched, without the host waiting to find out. So the
+decision is taken on the device.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..arrays import upload
+
+
+class Adam:
+    """Updates a dictionary of tensors in place from their gradients."""
+
+    def __init__(
+        self,
+        parameters: dict[str, Any],
+        *,
+        beta1: float = 0.9,
+        beta2: float = 0.999,
+        epsilon: float = 1e-8,
+    ) -> None:
+        self._parameters = parameters
+        self._beta1, self._beta2, self._epsilon = beta1, beta2, epsilon
+        self._first = {n: dr.zeros(type(p), p.shape) for n, p in parameters.items()}
+        self._second = {n: dr.zeros(type(p), p.shape) for n, p in parameters.items()}
+        float_type = type(next(iter(parameters.values())).array)
+        self._steps = dr.zeros(float_type, 1)  # counts accepted steps only
+        for name in parameters:
+            self._renew(name, parameters[name])
+
+    def zero_grad(self) -> None:
+        """Forgets the gradients of all parameters."""
+        for tensor in self._parameters.values():
+            dr.clear_grad(tensor)
+
+    def step(self, learning_rate: float, accept: Any) -> Any:
+        """One update where ``accept`` (a mask of one element) and all gradients are finite.
+
+        Returns:
+            A mask of one element: whether the step was taken.
+        """
+        gradients = {n: dr.grad(p) for n, p in self._parameters.items()}
+        dr.eval(gradients)
+        norm = sum(dr.sum(dr.square(g.array)) for g in gradients.values())
+        accept = accept & dr.isfinite(norm)
+        self._steps = self._steps + dr.select(accept, type(self._steps)(1), 0)
+        rate = self._debiased_rate(learning_rate)
+        dr.eval(rate, self._steps, accept)
+        for name, g in gradients.items():
+            old, m, v = self._parameters[name], self._first[name], self._second[name]
+            m_new = dr.fma(m - g, self._beta1, g)
+            v_new = dr.fma(v - dr.square(g), self._beta2, dr.square(g))
+            new = dr.detach(old) - rate * m_new / (dr.sqrt(v_new) + self._epsilon)
+            self._first[name] = dr.select(accept, m_new, m)
+            self._second[name] = dr.select(accept, v_new, v)
+            self._renew(name, dr.select(accept, new, dr.detach(old)))
+        dr.schedule(self._parameters, self._first, self._second)
+        dr.eval()
+        return accept
+
+    def state(self) -> dict[str, np.ndarray[Any, Any]]:
+        """Moments and step count, by name."""
+        result = {f"first.{n}": np.array(t) for n, t in self._first.items()}
+        result |= {f"second.{n}": np.array(t) for n, t in self._second.items()}
+        result["steps"] = np.array(self._steps)
+        return result
+
+    def assign(self, name: str, value: Any) -> None:
+        """Replaces one parameter."""
+        self._renew(name, value)
+
+    def restore(self, state: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Takes up the result of :meth:`state`."""
+        for name, tensor in self._parameters.items():
+            self._first[name] = upload(type(tensor), state[f"first.{name}"])
+            self._second[name] = upload(type(tensor), state[f"second.{name}"])
+        self._steps = upload(type(self._steps), state["steps"])
+
+    def _renew(self, name: str, value: Any) -> None:
+        value = dr.detach(value)
+        dr.enable_grad(value)
+        self._parameters[name] = value
+
+    def _debiased_rate(self, learning_rate: float) -> Any:
+        rate = dr.opaque(type(self._steps), learning_rate)
+        bias1 = 1 - dr.power(self._beta1, self._steps)
+        bias2 = 1 - dr.power(self._beta2, self._steps)
+        return rate * dr.sqrt(bias2) / dr.select(bias1 > 0, bias1, 1)

@@ -1,0 +1,55 @@
+"""Named starting points for :class:`TrainConfig`."""
+
+from __future__ import annotations
+
+from ..encoding import FourierEncoding
+from ..errors import InputError
+from ..network import NetworkConfig
+from .config import (
+    DensityConfig,
+    OccupancyConfig,
+    OptimizerConfig,
+    SamplingConfig,
+    TrainConfig,
+)
+
+
+def nerf() -> TrainConfig:
+    """A Fourier-feature MLP made fast on the machine at hand (the default)."""
+    return TrainConfig(
+        preset="nerf",
+        network=NetworkConfig(depth=4, width=64, skip=-1, view_width=32, feature_layer=False),
+        position=FourierEncoding(frequencies=8),
+        direction=FourierEncoding(frequencies=2),
+        density=DensityConfig(gain=10.0),
+        optimizer=OptimizerConfig(lr=5e-3, lr_final=5e-4),
+    )
+
+
+def paper() -> TrainConfig:
+    """The published architecture and schedule, one network (NeRF Sec. 5.3)."""
+    return TrainConfig(
+        preset="paper",
+        background="white",
+        density=DensityConfig(activation="relu", shift=0.0),
+        occupancy=OccupancyConfig(enabled=False, hull=False),
+        sampling=SamplingConfig(samples=192, render_samples=192, rays=4096, batch=1 << 20),
+        optimizer=OptimizerConfig(warmup=0, beta2=0.999, epsilon=1e-7),
+    )
+
+
+PRESETS = {"nerf": nerf, "paper": paper}
+
+
+def preset(name: str) -> TrainConfig:
+    """The preset called ``name``.
+
+    Raises:
+        InputError: if there is none, with the names there are.
+    """
+    if name not in PRESETS:
+        raise InputError(f"preset '{name}': unknown, expected one of {', '.join(PRESETS)}")
+    return PRESETS[name]()
+
+
+__all__ = ["PRESETS", "preset"]

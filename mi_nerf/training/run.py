@@ -1,0 +1,407 @@
+"""A training run: a folder, a clock, a log, and the loop around the trainer's steps."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from tqdm.auto import tqdm
+
+from .. import __version__
+from ..backend import array_module
+from ..data import Dataset, load_dataset
+from ..errors import InputError
+from ..field_file import FieldFile, save_field
+from ..files import make_folder, read_json, write_json
+from ..volume import MarchSettings
+from .checkpoint import load_checkpoint, save_checkpoint
+from .config import TrainConfig, from_json, to_json
+from .schedule import learning_rate
+from .trainer import StepResult, Trainer
+
+CONFIG, CHECKPOINT, FIELD, LOG = (
+    "config.json",
+    "checkpoint.safetensors",
+    "field.safetensors",
+    "log.jsonl",
+)
+
+
+class TrainingError(RuntimeError):
+    """Training cannot go on; the message says why and what to try."""
+
+
+class Run:
+    """A run folder and the training that goes on in it."""
+
+    def __init__(
+        self,
+        folder: Path,
+        config: TrainConfig,
+        dataset: Dataset,
+        variant: str,
+        *,
+        started: float | None = None,
+    ) -> None:
+        """``started`` is the value of ``time.monotonic()`` from which seconds count."""
+        self.folder, self.config, self.variant = folder, config, variant
+        self._started = time.monotonic() if started is None else started
+        self.trainer = Trainer(config, dataset, array_module(variant))
+        self._blank = self.trainer.blank_loss
+        self._before = 0.0  # seconds of training before this process
+        self._skipped = 0
+        self._skipped_in_row = 0
+        self._attempt_start = 0
+        self._since = _Meter()
+        self._pending: StepResult | None = None
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock seconds of training so far, earlier processes included."""
+        return self._before + time.monotonic() - self._started
+
+    @property
+    def progress(self) -> float:
+        """How much of the budget is spent, 0 to 1: the larger share of steps and seconds."""
+        shares = [0.0]
+        if self.config.steps:
+            shares.append(self.trainer.step_count / self.config.steps)
+        if self.config.max_seconds:
+            shares.append(self.seconds / self.config.max_seconds)
+        return min(1.0, max(shares))
+
+    def resume(self) -> None:
+        """Goes back to the checkpoint of the folder, and cuts the log to match."""
+        state = load_checkpoint(self.folder / CHECKPOINT, self.trainer)
+        self._before = state["seconds"]
+        self._skipped = state["skipped"]
+        self._attempt_start = state["attempt_start"]
+        _cut_log(self.folder / LOG, self.trainer.step_count)
+
+    def train(self, show_bar: bool = True) -> None:
+        """Trains until the budget is spent or the user interrupts; always saves.
+
+        Raises:
+            TrainingError: after too many non-finite steps in a row, or collapses.
+        """
+        bar = _ProgressBar(self.config, self.progress, show_bar)
+        last_report = last_save = self.seconds
+        with (self.folder / LOG).open("a") as log, _interruptible() as stop, bar:
+            self._log = log
+            while self.progress < 1 and not stop:
+                self._advance()
+                if self._collapsed():
+                    self._restart()
+                now = self.seconds
+                finished = self.progress >= 1 or bool(stop)
+                if now - last_report >= self.config.report_every or finished:
+                    self._settle()
+                    bar.update(self.progress, self._report(), bool(stop))
+                    last_report = now
+                if now - last_save >= self.config.checkpoint_every:
+                    self.save()
+                    last_save = self.seconds
+            self._settle()
+            self.save()
+
+    def save(self) -> None:
+        """Writes the checkpoint and the field file."""
+        progress = {
+            "seconds": self.seconds,
+            "skipped": self._skipped,
+            "attempt_start": self._attempt_start,
+        }
+        save_checkpoint(self.folder / CHECKPOINT, self.trainer, progress)
+        save_field(self.folder / FIELD, self.field_file())
+
+    def field_file(self) -> FieldFile:
+        """The field as it is now, as XML scenes will load it."""
+        trainer, sampling = self.trainer, self.config.sampling
+        return FieldFile(
+            trainer.field_config,
+            trainer.field.weights(),
+            trainer.occupancy.mask() if trainer.occupancy is not None else None,
+            MarchSettings(
+                samples=sampling.render_samples, near=sampling.near, far=sampling.far
+            ),
+            {"mi_nerf": __version__, "preset": self.config.preset, "steps": trainer.step_count},
+        )
+
+    # ---------------------------------- One step ----------------------------------
+
+    def _advance(self) -> None:
+        """Launches a step, then reads the results of the one before."""
+        rate = learning_rate(
+            self.config.optimizer,
+            self.progress,
+            self.trainer.step_count - self._attempt_start,
+        )
+        result = self.trainer.step(rate)
+        self._settle()
+        self._pending = result
+        self._rate = rate
+
+    def _settle(self) -> None:
+        """Reads the results of the last step; waits for it."""
+        result, self._pending = self._pending, None
+        if result is None:
+            return
+        if result.accepted[0]:
+            self._skipped_in_row = 0
+            self._since.add(float(result.loss[0]), float(result.mse[0]), result)
+            return
+        self._skipped += 1
+        self._skipped_in_row += 1
+        if self._skipped_in_row >= self.config.max_skipped:
+            raise TrainingError(
+                f"loss or gradient not finite in {self._skipped_in_row} steps in a row at step "
+                f"{self.trainer.step_count}; try a smaller optimizer.lr"
+            )
+
+    # ---------------------------------- Collapse ----------------------------------
+
+    def _collapsed(self) -> bool:
+        """Whether the field is still no better than empty space when it should be."""
+        age = self.trainer.step_count - self._attempt_start
+        if age != self.config.collapse_check or self._since.recent is None:
+            return False
+        return self._since.recent > 0.95 * self._blank
+
+    def _restart(self) -> None:
+        self._settle()
+        if self.trainer.attempt >= self.config.max_restarts:
+            raise TrainingError(
+                f"collapsed {self.trainer.attempt + 1} times: the field stays as good as empty; "
+                "try another seed, a smaller optimizer.lr or another density.activation"
+            )
+        self.trainer.attempt += 1
+        self._attempt_start = self.trainer.step_count
+        self._write({"event": "restart", "attempt": self.trainer.attempt, "reason": "collapse"})
+        self.trainer.reset()
+        self._since = _Meter()
+
+    # ---------------------------------- Reports ----------------------------------
+
+    def _report(self) -> dict[str, Any]:
+        """Adds a line to the log and returns it."""
+        line = self._since.summary()
+        occupancy = self.trainer.occupancy
+        line |= {
+            "learning_rate": self._rate,
+            "occupied": 1.0 if occupancy is None else occupancy.fraction(),
+            "skipped": self._skipped,
+        }
+        self._since = _Meter(self._since.recent)
+        return self._write(line)
+
+    def _write(self, line: dict[str, Any]) -> dict[str, Any]:
+        line = {"step": self.trainer.step_count, "seconds": round(self.seconds, 3), **line}
+        self._log.write(json.dumps(line) + "\n")
+        self._log.flush()
+        return line
+
+
+class _Meter:
+    """Means over the steps since the last report."""
+
+    def __init__(self, recent: float | None = None) -> None:
+        self.recent = recent  # running mean of the squared error, across reports
+        self._losses: list[float] = []
+        self._errors: list[float] = []
+        self._rays = self._queries = 0
+        self._start = time.monotonic()
+
+    def add(self, loss: float, mse: float, result: StepResult) -> None:
+        self._losses.append(loss)
+        self._errors.append(mse)
+        self._rays += result.rays
+        self._queries += result.queries
+        self.recent = mse if self.recent is None else self.recent + 0.02 * (mse - self.recent)
+
+    def summary(self) -> dict[str, Any]:
+        elapsed = max(time.monotonic() - self._start, 1e-9)
+        mse = float(np.mean(self._errors)) if self._errors else math.nan
+        return {
+            "loss": float(np.mean(self._losses)) if self._losses else None,
+            "psnr": -10 * math.log10(mse) if mse > 0 else None,
+            "samples_per_ray": self._queries / max(self._rays, 1),
+            "rays": self._rays,
+            "samples_per_second": self._queries / elapsed,
+        }
+
+
+class _ProgressBar:
+    """A bar on a terminal, a quiet line now and then elsewhere."""
+
+    def __init__(self, config: TrainConfig, initial: float, show: bool) -> None:
+        by_time = config.max_seconds is not None
+        self._scale = config.max_seconds if by_time else (config.steps or 1)
+        terminal = show and _is_terminal()
+        self._bar = tqdm(
+            total=round(self._scale, 1),
+            initial=round(initial * self._scale, 1),
+            unit="s" if by_time else "step",
+            desc="train",
+            disable=not terminal,
+            bar_format="{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} {postfix}",
+        )
+        self._lines = show and not terminal
+        self._last_line = -math.inf
+
+    def __enter__(self) -> _ProgressBar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def update(self, progress: float, line: dict[str, Any], final: bool) -> None:
+        loss, psnr = line["loss"], line["psnr"]
+        text = (
+            f"loss {loss:.5f}, psnr {psnr:.2f} dB, " if loss is not None and psnr else ""
+        ) + f"{line['samples_per_second'] / 1e3:.0f}k samples/s"
+        self._bar.set_postfix_str(text, refresh=False)
+        self._bar.n = progress * self._scale
+        self._bar.refresh()
+        if self._lines and (line["seconds"] - self._last_line >= 10 or progress >= 1 or final):
+            print(f"step {line['step']}, {line['seconds']:.0f} s: {text}", flush=True)
+            self._last_line = line["seconds"]
+
+
+def start(
+    data: str | Path,
+    out: str | Path,
+    config: TrainConfig,
+    variant: str,
+    *,
+    resume: bool = False,
+    started: float | None = None,
+) -> Run:
+    """Opens a run: a new one in an empty folder, or the one that is there with ``resume``.
+
+    With ``resume`` the folder's own configuration holds; only ``steps`` and
+    ``max_seconds`` of ``config`` take its place, where given.
+
+    Raises:
+        InputError: if the folder already holds a run, or the data cannot be read.
+    """
+    folder = Path(out)
+    if resume and (folder / CONFIG).exists():
+        config = _resumed_config(folder, config, data)
+    elif (folder / CONFIG).exists() or (folder / CHECKPOINT).exists():
+        raise InputError(f"{folder}: already holds a run, expected --resume or another folder")
+    dataset = load_dataset(data, "train", downscale=config.downscale)
+    make_folder(folder)
+    dr.set_flag(dr.JitFlag.Debug, False)
+    run = Run(folder, config, dataset, variant, started=started)
+    if resume and (folder / CHECKPOINT).exists():
+        run.resume()
+    else:
+        (folder / LOG).unlink(missing_ok=True)
+        write_json(folder / CONFIG, _record(run, dataset))
+    return run
+
+
+def read_config(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
+    """The configuration of a run, and all that ``config.json`` records.
+
+    Raises:
+        InputError: if it is missing or not of this version.
+    """
+    path = folder / CONFIG
+    record = read_json(path, "the config.json of a run")
+    if not isinstance(record, dict) or "settings" not in record:
+        raise InputError(f"{path}: no 'settings', expected the config.json of a run")
+    return from_json(record["settings"], str(path)), record
+
+
+def _resumed_config(folder: Path, given: TrainConfig, data: str | Path) -> TrainConfig:
+    config, record = read_config(folder)
+    recorded = record.get("data", {}).get("path")
+    if recorded is not None and Path(recorded) != Path(data).resolve():
+        raise InputError(f"{data}: the run in {folder} was trained on {recorded}")
+    if given.steps is not None or given.max_seconds is not None:
+        config = replace(config, steps=given.steps, max_seconds=given.max_seconds)
+    return config
+
+
+def _record(run: Run, dataset: Dataset) -> dict[str, Any]:
+    """What ``config.json`` holds."""
+    import mitsuba as mi
+
+    field, size = run.trainer.field_config, dataset.intrinsics
+    return {
+        "settings": to_json(run.config),
+        "seed": run.config.seed,
+        "data": {
+            "path": str(dataset.path.resolve()),
+            "views": len(dataset),
+            "size": [size.width, size.height],
+            "color_space": dataset.color_space,
+            "has_alpha": dataset.has_alpha,
+        },
+        "field": {
+            "lower": field.lower,
+            "upper": field.upper,
+            "parameters": field.parameter_count(),
+        },
+        "variant": run.variant,
+        "versions": {
+            "mi_nerf": __version__,
+            "mitsuba": mi.__version__,
+            "drjit": dr.__version__,
+            "python": platform.python_version(),
+        },
+    }
+
+
+def _cut_log(path: Path, step: int) -> None:
+    """Drops lines of steps that the checkpoint has not seen."""
+    if not path.exists():
+        return
+    kept = []
+    for line in path.read_text().splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                kept.append(line)
+        except (ValueError, KeyError):  # a line cut short when the run was killed
+            continue
+    path.write_text("".join(line + "\n" for line in kept))
+
+
+@contextmanager
+def _interruptible() -> Iterator[list[int]]:
+    """Collects SIGINT and SIGTERM instead of raising; a second one acts as usual."""
+    received: list[int] = []
+    previous: dict[int, Any] = {}
+
+    def handler(number: int, _frame: Any) -> None:
+        received.append(number)
+        signal.signal(number, previous[number])
+
+    try:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            previous[number] = signal.getsignal(number)
+            signal.signal(number, handler)
+    except ValueError:  # not the main thread: signals go where they always go
+        previous.clear()
+    try:
+        yield received
+    finally:
+        for number, action in previous.items():
+            signal.signal(number, action)
+
+
+def _is_terminal() -> bool:
+    import sys
+
+    return sys.stderr.isatty()

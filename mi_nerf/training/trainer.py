@@ -1,0 +1,190 @@
+"""One training step, and the state that steps carry on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from .. import hull
+from ..data import Dataset
+from ..field import NeuralField, NeuralFieldConfig
+from ..occupancy import OccupancyGrid, grid_shape
+from ..quadrature import over_background
+from ..volume import Evaluation, MarchSettings, Samples, integrate, place_samples
+from .batches import RaySource, blank_loss, step_rng
+from .config import TrainConfig
+from .losses import LOSSES, squared_error
+from .optimizer import Adam
+
+
+@dataclass
+class StepResult:
+    """Device-side results of a step, each an array of one value."""
+
+    loss: Any
+    mse: Any
+    accepted: Any
+    rays: int
+    queries: int
+
+
+def field_config(config: TrainConfig, dataset: Dataset) -> NeuralFieldConfig:
+    """The field that a run trains: the configured model over the dataset's box."""
+    if config.box is not None:
+        lower, upper = config.box[:3], config.box[3:]
+    else:
+        lower, upper = hull.view_box(dataset)
+        if config.occupancy.hull:
+            lower, upper = hull.tighten(dataset, lower, upper)
+    color = config.color_activation
+    if color == "auto":
+        color = "sigmoid" if dataset.color_space == "srgb" else "exp"
+    model = NeuralFieldConfig(
+        color_space=dataset.color_space,
+        position=config.position,
+        direction=config.direction,
+        network=config.network,
+        density_activation=config.density.activation,
+        density_shift=config.density.shift,
+        density_scale=config.density.gain,
+        color_activation=color,
+    )
+    return model.in_box(lower, upper)
+
+
+class Trainer:
+    """Holds a field, its optimiser and its occupancy, and improves them step by step."""
+
+    def __init__(self, config: TrainConfig, dataset: Dataset, backend: Any) -> None:
+        """``backend`` is ``drjit.llvm.ad`` or ``drjit.cuda.ad``."""
+        self.config, self._backend = config, backend
+        self.field_config = field_config(config, dataset)
+        self._hull = self._carve(dataset)
+        background = config.background
+        if background == "auto":
+            background = "random" if dataset.has_alpha else "white"
+        self._source = RaySource(dataset, background, backend.Float)
+        self.blank_loss = blank_loss(dataset, background)
+        loss = config.loss
+        if loss == "auto":
+            loss = "mse" if dataset.color_space == "srgb" else "relative"
+        self._loss = LOSSES[loss]
+        self.step_count = 0
+        self.attempt = 0  # restarts after a collapse so far
+        self.rays_per_step = 0.0
+        self.reset()
+
+    def reset(self) -> None:
+        """Fresh weights, moments and occupancy, from the seed and the attempt."""
+        config = self.config
+        seed = config.seed + 1000 * self.attempt
+        self.field = NeuralField.create(self.field_config, seed, self._backend.TensorXf)
+        options = config.optimizer
+        self.optimizer = Adam(
+            self.field.parameters(),
+            beta1=options.beta1,
+            beta2=options.beta2,
+            epsilon=options.epsilon,
+        )
+        self.occupancy = None
+        if config.occupancy.enabled:
+            self.occupancy = OccupancyGrid(
+                self.field.lower, self.field.upper, self._hull, self._backend.Float
+            )
+        sampling = config.sampling
+        self.rays_per_step = float(
+            sampling.rays or min(sampling.max_rays, max(1, sampling.batch // sampling.samples))
+        )
+
+    def march_settings(self) -> MarchSettings:
+        """How rays are sampled in training."""
+        s = self.config.sampling
+        return MarchSettings(samples=s.samples, near=s.near, far=s.far, block=s.block)
+
+    def step(self, learning_rate: float) -> StepResult:
+        """One optimisation step. Launches work; reads nothing back but sample counts."""
+        config = self.config
+        rng = step_rng(self._backend.Float, config.seed, self.step_count)
+        rays = self._ray_count()
+        batch = self._source.draw(rays, rng)
+        jitter = rng.random(self._backend.Float, rays * config.sampling.samples)
+        samples = place_samples(
+            self.field,
+            batch.o,
+            batch.d,
+            self.march_settings(),
+            occupancy=self.occupancy,
+            jitter=jitter,
+        )
+        self._adapt_rays(samples)
+        complete = samples.truncate(config.sampling.batch)
+        loss, mse = self._differentiate(batch, samples, complete)
+        accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
+        self.step_count += 1
+        self._refresh_occupancy()
+        return StepResult(loss, mse, accepted, complete, samples.queries)
+
+    def _differentiate(self, batch: Any, samples: Samples, complete: int) -> tuple[Any, Any]:
+        """Loss over the first ``complete`` rays; gradients end in the field's parameters."""
+        self.optimizer.zero_grad()
+        evaluation = Evaluation(
+            self.field, samples, self.config.sampling.block, keep=self._keep(samples)
+        )
+        evaluation.enable_grad()
+        seen = integrate(evaluation, samples)
+        predicted = over_background(seen.color, seen.opacity, batch.background)
+        target = over_background(batch.color, batch.alpha, batch.background)
+        float_type = self._backend.Float
+        index = dr.arange(self._backend.UInt32, samples.rays)
+        used = index < dr.opaque(self._backend.UInt32, complete)
+        share = dr.opaque(float_type, 1 / max(complete, 1))
+        loss = dr.sum(dr.select(used, self._loss(predicted, target), 0)) * share
+        mse = dr.sum(dr.select(used, dr.detach(squared_error(predicted, target)), 0)) * share
+        dr.backward(loss)
+        loss = dr.detach(loss)
+        dr.eval(loss, mse)
+        evaluation.backward()
+        return loss, mse
+
+    def _carve(self, dataset: Dataset) -> np.ndarray[Any, Any]:
+        lower, upper = self.field_config.lower, self.field_config.upper
+        options = self.config.occupancy
+        if options.hull:
+            return hull.carve(dataset, lower, upper, options.resolution)
+        return np.ones(grid_shape(lower, upper, options.resolution), bool)
+
+    def _ray_count(self) -> int:
+        """Rays of the next step, in steps of 64 so that arrays are seldom resized."""
+        if self.config.sampling.rays is not None:
+            return self.config.sampling.rays
+        return max(64, int(self.rays_per_step) // 64 * 64)
+
+    def _adapt_rays(self, samples: Samples) -> None:
+        """Aims at a full batch: more rays as space turns out to be empty."""
+        sampling = self.config.sampling
+        wanted = 0.95 * sampling.batch * samples.rays / max(samples.queries, 1)
+        wanted = min(max(wanted, 64.0), float(sampling.max_rays))
+        self.rays_per_step += 0.1 * (wanted - self.rays_per_step)
+
+    def _keep(self, samples: Samples) -> bool:
+        """Whether the activations of this batch fit in the memory set aside for them."""
+        network = self.config.network
+        units = 2 * (network.depth + 1) * network.width + network.view_width
+        return samples.queries * units * 4 < self.config.store_activations * 2**30
+
+    def _refresh_occupancy(self) -> None:
+        options = self.config.occupancy
+        due = self.step_count >= options.start and self.step_count % options.every == 0
+        if self.occupancy is not None and due:
+            rng = step_rng(self._backend.Float, self.config.seed + (1 << 20), self.step_count)
+            self.occupancy.refresh(
+                self.field,
+                rng,
+                self.step_count // options.every,
+                queries=options.queries,
+                threshold=options.threshold,
+                decay=options.decay,
+            )

@@ -1,0 +1,270 @@
+"""Renders rays through a field: the one path that training, evaluation and plugins share.
+
+    rays → interval in the box → strata → (cells that may hold something)
+         → field, in blocks of constant size → quadrature
+
+The field sees its queries in blocks of a constant number of columns, so tensor-mode
+kernels are compiled once whatever the number of samples a ray batch needs. The
+quadrature works on all samples at once. Its adjoint reaches the field block by
+block, which is what bounds the memory of a gradient.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from .field import Field
+from .occupancy import OccupancyGrid
+from .quadrature import Composite, composite
+from .sampling import box_interval, clip_interval, points_along, stratified
+
+
+@dataclass(frozen=True)
+class MarchSettings:
+    """How rays are sampled."""
+
+    samples: int = 128  # strata a ray
+    near: float | None = None  # lower bound of t, in scene units; None: the box alone
+    far: float | None = None  # upper bound of t
+    block: int = 16384  # queries a network evaluation
+    chunk: int = 1 << 20  # samples placed at a time in primal rendering
+
+    def __post_init__(self) -> None:
+        for name in ("samples", "block", "chunk"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}, expected at least 1")
+        if self.near is not None and self.far is not None and not self.near < self.far:
+            raise ValueError(f"near={self.near} must be smaller than far={self.far}")
+
+
+@dataclass
+class Samples:
+    """R·S samples of R rays, and which of them the field has to be asked about."""
+
+    o: Any  # R origins
+    d: Any  # R unit directions
+    t: Any  # R·S sample parameters
+    delta: Any  # R·S interval lengths
+    count: int  # S
+    index: Any  # the M samples to evaluate, ascending
+
+    @property
+    def rays(self) -> int:
+        """R."""
+        return len(self.t) // self.count
+
+    @property
+    def queries(self) -> int:
+        """M."""
+        return len(self.index)
+
+    def truncate(self, budget: int) -> int:
+        """Keeps the first ``budget`` queries; returns how many rays keep all of theirs.
+
+        Rays from that number on are incomplete and must be left out of a loss.
+        """
+        if self.queries <= budget:
+            return self.rays
+        uint = type(self.index)
+        first_lost = int(self.index[budget])
+        self.index = dr.gather(uint, self.index, dr.arange(uint, budget))
+        return first_lost // self.count
+
+
+def place_samples(
+    field: Field,
+    o: Any,
+    d: Any,
+    settings: MarchSettings,
+    *,
+    occupancy: OccupancyGrid | None = None,
+    jitter: Any = None,
+    bounds: tuple[Any, Any] | None = None,
+) -> Samples:
+    """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
+
+    ``jitter`` is passed on to :func:`mi_nerf.sampling.stratified`; ``bounds`` limits t
+    ray by ray, besides what ``settings`` say. Sample positions carry no gradient.
+    """
+    with dr.suspend_grad():
+        near, far, hit = clip_interval(
+            *box_interval(o, d, field.lower, field.upper), settings.near, settings.far
+        )
+        if bounds is not None:
+            near, far, hit = clip_interval(near, far, hit, *bounds)
+        t, delta = stratified(near, far, settings.samples, jitter)
+        dr.eval(t, delta)
+        uint = dr.uint32_array_t(type(t))
+        ray = dr.arange(uint, len(t)) // settings.samples
+        wanted = dr.gather(dr.mask_t(type(t)), hit, ray)
+        if occupancy is not None:
+            wanted &= occupancy.occupied(points_along(o, d, t, ray))
+        index = uint(dr.compress(wanted))
+    return Samples(o, d, t, delta, settings.samples, index)
+
+
+class Evaluation:
+    """A field's answers at all samples, zero where it was not asked.
+
+    ``density`` and ``emission`` are R·S arrays without history. To differentiate,
+    enable their gradients, differentiate what was made of them, then call
+    :meth:`backward`: it carries their gradients into the field's parameters.
+    """
+
+    def __init__(self, field: Field, samples: Samples, block: int, *, keep: bool = False) -> None:
+        """Evaluates the field; with ``keep``, activations stay for :meth:`backward`."""
+        self._field, self._samples, self._block = field, samples, block
+        self._graph: list[tuple[Any, Any, list[Any]]] = []
+        float_type = type(samples.t)
+        self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4)]
+        for where, valid in self._blocks():
+            if keep:
+                outputs = self._query(where)
+                self._graph.append((where, valid, outputs))
+            else:
+                with dr.suspend_grad():
+                    outputs = self._query(where)
+            for channel, value in zip(self._channels, outputs, strict=True):
+                dr.scatter(channel, dr.detach(value), where, valid)
+            dr.eval(self._channels, outputs)
+
+    @property
+    def density(self) -> Any:
+        """R·S densities, 1/scene unit."""
+        return self._channels[0]
+
+    @property
+    def emission(self) -> list[Any]:
+        """Three arrays of R·S colours."""
+        return self._channels[1:]
+
+    def enable_grad(self) -> None:
+        """Makes density and emission the leaves of what is computed next."""
+        for channel in self._channels:
+            dr.enable_grad(channel)
+
+    def backward(self) -> None:
+        """Propagates the gradients of density and emission to the parameters."""
+        gradients = [dr.grad(channel) for channel in self._channels]
+        dr.eval(gradients)
+        kept = self._graph or ((w, v, None) for w, v in self._blocks())
+        for where, valid, outputs in kept:
+            outputs = outputs or self._query(where)
+            for value, gradient in zip(outputs, gradients, strict=True):
+                if dr.grad_enabled(value):
+                    dr.set_grad(value, dr.gather(type(value), gradient, where, valid))
+                    dr.enqueue(dr.ADMode.Backward, value)
+            dr.traverse(dr.ADMode.Backward)
+            dr.eval([dr.grad(p) for p in self._field.parameters().values()])
+        self._graph = []
+
+    def forward(self) -> None:
+        """Fills the gradients of density and emission from those of the parameters."""
+        tangents = [dr.zeros(type(c), len(c)) for c in self._channels]
+        for where, valid in self._blocks():
+            outputs = self._query(where)
+            dr.forward_to(outputs, flags=dr.ADFlag.ClearInterior)
+            for tangent, value in zip(tangents, outputs, strict=True):
+                dr.scatter(tangent, dr.grad(value), where, valid)
+            dr.eval(tangents)
+        for channel, tangent in zip(self._channels, tangents, strict=True):
+            dr.set_grad(channel, tangent)
+
+    def _blocks(self) -> Iterator[tuple[Any, Any]]:
+        """Sample numbers and validity of each block; the last one is padded."""
+        samples = self._samples
+        uint = type(samples.index)
+        for start in range(0, samples.queries, self._block):
+            slot = dr.arange(uint, self._block) + dr.opaque(uint, start)
+            valid = slot < dr.opaque(uint, samples.queries)
+            where = dr.gather(uint, samples.index, slot, valid)
+            dr.eval(where, valid)
+            yield where, valid
+
+    def _query(self, where: Any) -> list[Any]:
+        samples = self._samples
+        ray = where // samples.count
+        t = dr.gather(type(samples.t), samples.t, where)
+        p = points_along(samples.o, samples.d, t, ray)
+        d = type(p)(*(dr.gather(type(t), samples.d[i], ray) for i in range(3)))
+        density, emission = self._field.density_emission(p, d)
+        return [density, *emission]
+
+
+def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
+    """Quadrature of an evaluated batch; differentiable in density and emission."""
+    return composite(
+        evaluation.density, evaluation.emission, samples.t, samples.delta, samples.count
+    )
+
+
+@dataclass
+class RayImage:
+    """What R rays see, without background, in the field's colour space."""
+
+    color: list[Any]  # three arrays of R values, premultiplied by the opacity
+    opacity: Any
+    depth: Any  # distance along the unit ray, scene units; 0 where nothing is seen
+    queries: int  # how often the field was asked
+
+
+def ray_chunks(rays: int, settings: MarchSettings) -> Iterator[tuple[int, int]]:
+    """Splits R rays into ranges whose samples fit in ``settings.chunk``."""
+    size = max(1, settings.chunk // settings.samples)
+    for start in range(0, rays, size):
+        yield start, min(size, rays - start)
+
+
+def render_rays(
+    field: Field,
+    o: Any,
+    d: Any,
+    settings: MarchSettings,
+    *,
+    occupancy: OccupancyGrid | None = None,
+    jitter: Any = None,
+) -> RayImage:
+    """Renders R rays without derivatives, in chunks of bounded memory.
+
+    Args:
+        o, d: origins and unit directions, in the field's coordinates.
+        jitter: R numbers in [0, 1) that shift the samples of each ray within their
+            strata; ``None`` for the middle of each stratum.
+    """
+    float_type = type(o[0])
+    rays = max(len(o[0]), len(d[0]))
+    outputs = [dr.zeros(float_type, rays) for _ in range(5)]
+    queries = 0
+    with dr.suspend_grad():
+        for start, size in ray_chunks(rays, settings):
+            index, chunk_o, chunk_d, offset = slice_rays(o, d, jitter, start, size)
+            samples = place_samples(
+                field, chunk_o, chunk_d, settings, occupancy=occupancy, jitter=offset
+            )
+            result = integrate(Evaluation(field, samples, settings.block), samples)
+            values = [*result.color, result.opacity, result.depth]
+            for output, value in zip(outputs, values, strict=True):
+                dr.scatter(output, value, index)
+            dr.eval(outputs)
+            queries += samples.queries
+    return RayImage(outputs[:3], outputs[3], outputs[4], queries)
+
+
+def slice_rays(o: Any, d: Any, jitter: Any, start: int, size: int) -> tuple[Any, Any, Any, Any]:
+    """Rays ``start … start + size`` of a batch, with their indices and jitter."""
+    float_type = type(o[0])
+    uint = dr.uint32_array_t(float_type)
+    index = dr.arange(uint, size) + dr.opaque(uint, start)
+
+    def take(v: Any) -> Any:
+        return dr.gather(float_type, v, index)
+
+    part_o = type(o)(*(take(o[i]) for i in range(3)))
+    part_d = type(d)(*(take(d[i]) for i in range(3)))
+    offset = None if jitter is None else take(jitter)
+    dr.eval(index, part_o, part_d, offset)
+    return index, part_o, part_d, offset
