@@ -33,7 +33,8 @@ def choose_variant(requested: str | None = None) -> str:
         )
     if requested is not None and requested not in available:
         raise InputError(
-            f"variant '{requested}': does not work on this machine, expected {' or '.join(available)}"
+            f"variant '{requested}': does not work on this machine, "
+            f"expected {' or '.join(available)}"
         )
     return requested or available[0]
 

@@ -13,7 +13,7 @@ from typing import Any
 
 import tyro
 
-from .commands import Command
+from .commands import COMMANDS, command_type
 from .errors import InputError
 from .training.run import TrainingError
 
@@ -47,7 +47,7 @@ def _parse(arguments: list[str]) -> Any:
     try:
         with contextlib.redirect_stderr(message):
             return tyro.cli(
-                Command,  # type: ignore[arg-type]
+                command_type(arguments[0] if arguments[0] in COMMANDS else None),
                 prog="mi-nerf",
                 description="Neural radiance fields in Mitsuba 3.",
                 args=_spread_lists(arguments),

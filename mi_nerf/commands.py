@@ -6,8 +6,7 @@ import inspect
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
-
+from typing import Annotated, Any, Literal, Union
 
 from tqdm.auto import tqdm
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
@@ -67,7 +66,9 @@ class Train:
     def run(self, started: float) -> None:
         """Trains."""
         config = preset(self.preset)
-        config = replace(config, seed=_seed(self.seed), downscale=_positive("downscale", self.downscale))
+        config = replace(
+            config, seed=_seed(self.seed), downscale=_positive("downscale", self.downscale)
+        )
         config = with_settings(config, list(self.set))
         limits = {"steps": self.steps, "max_seconds": self.max_seconds}
         for name, value in limits.items():
@@ -262,18 +263,17 @@ class Demo:
         )
 
 
-def _documented(command: type, name: str) -> Any:
-    """A sub-command whose ``--help`` shows the whole docstring, examples included."""
-    return subcommand(name, description=inspect.getdoc(command))
+COMMANDS = {"demo": Demo, "train": Train, "eval": Eval, "render": Render, "info": Info}
 
 
-Command = (
-    Annotated[Demo, _documented(Demo, "demo")]
-    | Annotated[Train, _documented(Train, "train")]
-    | Annotated[Eval, _documented(Eval, "eval")]
-    | Annotated[Render, _documented(Render, "render")]
-    | Annotated[Info, _documented(Info, "info")]
-)
+def command_type(chosen: str | None) -> Any:
+    """All sub-commands as one type for tyro; only the chosen one shows its examples."""
+    options = []
+    for name, command in COMMANDS.items():
+        text = inspect.getdoc(command) or ""
+        shown = text if name == chosen else text.splitlines()[0]
+        options.append(Annotated[command, subcommand(name, description=shown)])
+    return Union[tuple(options)]  # noqa: UP007
 
 
 def _positive(name: str, value: Any) -> Any:
@@ -295,6 +295,3 @@ def _bar(name: str, unit: str, total: int | None = None) -> tqdm[Any]:
 
 def _number(value: float | None, form: str) -> str:
     return "n/a" if value is None else format(value, form)
-
-
-

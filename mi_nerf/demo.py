@@ -183,4 +183,3 @@ _SCENE_XML = """<scene version="3.0.0">
     </shape>
 </scene>
 """
-

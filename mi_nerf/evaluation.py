@@ -56,7 +56,8 @@ def evaluate(
     folder = None if images is None else make_folder(images)
     backend = array_module(variant)
     field, occupancy = target.contents.build(backend)
-    results, seconds, queries = [], [], 0
+    results: list[dict[str, Any]] = []
+    seconds, queries = [], 0
     for k, name in enumerate(dataset.names):
         start = time.perf_counter()
         view = render_view(
@@ -70,7 +71,7 @@ def evaluate(
         seconds.append(time.perf_counter() - start)
         queries += view.queries
         predicted = to_8bit(display_image(view, field.color_space))
-        result = {"name": name, **_compare(predicted, reference_image(dataset, k))}
+        result: dict[str, Any] = {"name": name, **_compare(predicted, reference_image(dataset, k))}
         results.append(result)
         if folder is not None:
             with replacing(folder / f"{name}.png") as path:

@@ -85,12 +85,12 @@ class NeuralFieldConfig:
         depend on the unit of the scene.
         """
         half = max(b - a for a, b in zip(lower, upper, strict=True)) / 2
-        center = tuple((a + b) / 2 for a, b in zip(lower, upper, strict=True))
+        x, y, z = ((a + b) / 2 for a, b in zip(lower, upper, strict=True))
         return dataclasses.replace(
             self,
             lower=lower,
             upper=upper,
-            input_center=center,
+            input_center=(x, y, z),
             input_scale=1 / half,
             density_scale=self.density_scale * self._half_side() / half,
         )

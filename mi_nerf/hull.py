@@ -35,9 +35,7 @@ def view_box(dataset: Dataset) -> tuple[Corner, Corner]:
     return _corner(center - half), _corner(center + half)
 
 
-def carve(
-    dataset: Dataset, lower: Corner, upper: Corner, resolution: int
-) -> np.ndarray[Any, Any]:
+def carve(dataset: Dataset, lower: Corner, upper: Corner, resolution: int) -> np.ndarray[Any, Any]:
     """Cells of the box that no view shows to be empty.
 
     Returns:

@@ -111,9 +111,7 @@ def density_head(weights: dict[str, Any], h: Any) -> Any:
     return _layer(weights, "density", h, {}).array
 
 
-def color_head(
-    config: NetworkConfig, weights: dict[str, Any], h: Any, direction: Any
-) -> list[Any]:
+def color_head(config: NetworkConfig, weights: dict[str, Any], h: Any, direction: Any) -> list[Any]:
     """Raw colour of N queries, one array a channel; ``direction`` is γ(d) as a tensor."""
     if config.feature_layer:
         h = _layer(weights, "feature", h, {})

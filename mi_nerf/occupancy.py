@@ -37,9 +37,7 @@ class OccupancyGrid:
         self._float, self._uint = float_type, dr.uint32_array_t(float_type)
         self._candidates = upload(self._uint, np.flatnonzero(cells).astype(np.uint32))
         self._values = upload(float_type, np.where(cells.ravel(), _UNSEEN, 0))
-        self._hull = dr.mask_t(float_type)(cells.ravel())
-        self._mask = dr.mask_t(float_type)(self._hull)
-        dr.eval(self._mask)
+        self._hull = self._mask = self._upload_mask(cells)
 
     @property
     def cell_size(self) -> np.ndarray[Any, Any]:
@@ -102,8 +100,12 @@ class OccupancyGrid:
             if array.shape != self.shape:
                 raise ValueError(f"occupancy grid is {array.shape}, expected {self.shape}")
         self._values = upload(self._float, np.asarray(values, np.float32).ravel())
-        self._mask = dr.mask_t(self._float)(np.asarray(mask, bool).ravel())
-        dr.eval(self._mask)
+        self._mask = self._upload_mask(mask)
+
+    def _upload_mask(self, cells: np.ndarray[Any, Any]) -> Any:
+        mask = upload(self._uint, cells.ravel().astype(np.uint32)) != 0
+        dr.eval(mask)
+        return mask
 
     def _look(
         self, field: Field, pool: Any, first: int, count: int, rng: Any, decay: float
@@ -111,7 +113,8 @@ class OccupancyGrid:
         uint = self._uint
         turn = dr.arange(uint, count) + dr.opaque(uint, first % len(pool))
         cell = dr.gather(uint, pool, turn % dr.opaque(uint, len(pool)))
-        rest, where = cell, []
+        rest = cell
+        where: list[Any] = []
         for size in reversed(self.shape):
             where.insert(0, rest % size)
             rest = rest // size

@@ -102,12 +102,14 @@ def scene_frames(
 
     def still() -> Frames:
         for i, sensor in enumerate(sensors):
-            yield f"sensor_{i:03d}", _bitmap_rgba(mi.render(scene, sensor=sensor, spp=spp))
+            yield f"sensor_{i:03d}", _render_scene(scene, sensor, spp)
 
     if path is None:
         return len(sensors), still()
     if path == "test":
-        raise InputError(f"{scene_path}: a scene has no test views, expected --path orbit or spiral")
+        raise InputError(
+            f"{scene_path}: a scene has no test views, expected --path orbit or spiral"
+        )
     return frames, _moving(scene, sensors[0], path, frames, spp)
 
 
@@ -235,6 +237,18 @@ def _linear_rgba(color: Image, opacity: Image, color_space: str) -> Image:
     return np.concatenate([color, alpha], axis=-1).astype(np.float32)
 
 
+def _render_scene(scene: Any, sensor: Any, spp: int, seed: int = 0) -> Image:
+    """``mi.render``, with what the user can mend said by an InputError."""
+    import mitsuba as mi
+
+    try:
+        return _bitmap_rgba(mi.render(scene, sensor=sensor, spp=spp, seed=seed))
+    except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
+        if isinstance(error.__cause__, InputError):
+            raise error.__cause__ from None
+        raise
+
+
 def _bitmap_rgba(image: Any) -> Image:
     """The colour channels of a Mitsuba image, opaque where the film has no alpha."""
     pixels = np.array(image)
@@ -262,7 +276,7 @@ def _moving(scene: Any, sensor: Any, path: Path_, frames: int, spp: int) -> Fram
         matrix = mi.ScalarTransform4f(mitsuba_from_opengl(pose))
         parameters["to_world"] = mi.Transform4f(matrix)
         parameters.update()
-        yield f"{path}_{i:03d}", _bitmap_rgba(mi.render(scene, sensor=sensor, spp=spp, seed=i))
+        yield f"{path}_{i:03d}", _render_scene(scene, sensor, spp, seed=i)
 
 
 def _aim(pose: Image, center: Image) -> Image:

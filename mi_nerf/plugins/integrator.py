@@ -8,7 +8,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba.ad.integrators.common import ADIntegrator  # type: ignore[import-untyped]
+from mitsuba.ad.integrators.common import ADIntegrator
 
 from ..color import srgb_to_linear
 from ..errors import InputError

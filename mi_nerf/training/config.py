@@ -34,7 +34,7 @@ class OccupancyConfig:
     threshold: float = 0.01  # optical thickness of a cell below which it counts as empty
     decay: float = 0.9  # of remembered densities, at each refresh of a cell
     every: int = 16  # steps between refreshes
-    queries: int = 16384  # cells looked at in one refresh
+    queries: int = 8192  # cells looked at in one refresh
     start: int = 256  # steps before the first refresh
 
 
@@ -78,7 +78,7 @@ class TrainConfig:
     loss: Literal["auto", "mse", "relative"] = "auto"
     color_activation: Literal["auto"] | ColorActivation = "auto"
     network: NetworkConfig = field(default_factory=NetworkConfig)
-    position: FourierEncoding = field(default_factory=FourierEncoding)
+    position: FourierEncoding | None = None  # none: as many octaves as the images resolve
     direction: FourierEncoding = field(default_factory=lambda: FourierEncoding(frequencies=4))
     density: DensityConfig = field(default_factory=DensityConfig)
     occupancy: OccupancyConfig = field(default_factory=OccupancyConfig)
@@ -103,7 +103,9 @@ def from_json(data: dict[str, Any], source: str) -> TrainConfig:
     try:
         config: TrainConfig = _build(TrainConfig, data)
     except (TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{source}: not a training configuration of this version: {error}") from error
+        raise InputError(
+            f"{source}: not a training configuration of this version: {error}"
+        ) from error
     return config
 
 
@@ -111,9 +113,9 @@ def _build(cls: Any, data: dict[str, Any]) -> Any:
     hints = typing.get_type_hints(cls)
     values = {}
     for key, value in data.items():
-        hint = hints[key]
-        if dataclasses.is_dataclass(hint):
-            value = _build(hint, value)
+        nested = _nested(hints[key])
+        if nested is not None and value is not None:
+            value = _build(nested, value)
         elif isinstance(value, list):
             value = tuple(value)
         values[key] = value
@@ -139,9 +141,9 @@ def setting_names(config: Any = None, prefix: str = "") -> list[str]:
     config = TrainConfig() if config is None else config
     names = []
     for f in dataclasses.fields(config):
-        value = getattr(config, f.name)
-        if dataclasses.is_dataclass(value):
-            names += setting_names(value, f"{prefix}{f.name}.")
+        nested = _nested(typing.get_type_hints(type(config))[f.name])
+        if nested is not None:
+            names += setting_names(nested(), f"{prefix}{f.name}.")
         else:
             names.append(prefix + f.name)
     return names
@@ -150,19 +152,27 @@ def setting_names(config: Any = None, prefix: str = "") -> list[str]:
 def _assign(config: Any, path: list[str], text: str, assignment: str) -> Any:
     name, rest = path[0], path[1:]
     hints = typing.get_type_hints(type(config))
-    nested = name in hints and dataclasses.is_dataclass(hints[name])
-    if name not in hints or bool(rest) != nested:
+    nested = _nested(hints[name]) if name in hints else None
+    if name not in hints or bool(rest) != (nested is not None):
         raise InputError(
             f"--set {assignment}: unknown setting, expected one of {', '.join(setting_names())}"
         )
-    if nested:
-        value = _assign(getattr(config, name), rest, text, assignment)
+    if nested is not None:
+        value = _assign(getattr(config, name) or nested(), rest, text, assignment)
     else:
         value = _parse(text, hints[name], assignment)
     try:
         return dataclasses.replace(config, **{name: value})
     except ValueError as error:
         raise InputError(f"--set {assignment}: {error}") from error
+
+
+def _nested(hint: Any) -> Any:
+    """The dataclass that a setting holds, or may hold; ``None`` for plain values."""
+    for option in (hint, *typing.get_args(hint)):
+        if dataclasses.is_dataclass(option):
+            return option
+    return None
 
 
 def _parse(text: str, hint: Any, assignment: str) -> Any:

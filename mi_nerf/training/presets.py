@@ -18,11 +18,11 @@ def nerf() -> TrainConfig:
     """A Fourier-feature MLP made fast on the machine at hand (the default)."""
     return TrainConfig(
         preset="nerf",
-        network=NetworkConfig(depth=4, width=64, skip=-1, view_width=32, feature_layer=False),
-        position=FourierEncoding(frequencies=8),
+        network=NetworkConfig(depth=2, width=128, skip=-1, feature_layer=False, view_width=32),
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
-        optimizer=OptimizerConfig(lr=5e-3, lr_final=5e-4),
+        sampling=SamplingConfig(batch=4096),
+        optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3),
     )
 
 
@@ -31,6 +31,7 @@ def paper() -> TrainConfig:
     return TrainConfig(
         preset="paper",
         background="white",
+        position=FourierEncoding(frequencies=10),
         density=DensityConfig(activation="relu", shift=0.0),
         occupancy=OccupancyConfig(enabled=False, hull=False),
         sampling=SamplingConfig(samples=192, render_samples=192, rays=4096, batch=1 << 20),

@@ -131,9 +131,7 @@ class Run:
             trainer.field_config,
             trainer.field.weights(),
             trainer.occupancy.mask() if trainer.occupancy is not None else None,
-            MarchSettings(
-                samples=sampling.render_samples, near=sampling.near, far=sampling.far
-            ),
+            MarchSettings(samples=sampling.render_samples, near=sampling.near, far=sampling.far),
             {"mi_nerf": __version__, "preset": self.config.preset, "steps": trainer.step_count},
         )
 
@@ -245,7 +243,7 @@ class _ProgressBar:
 
     def __init__(self, config: TrainConfig, initial: float, show: bool) -> None:
         by_time = config.max_seconds is not None
-        self._scale = config.max_seconds if by_time else (config.steps or 1)
+        self._scale = float(config.max_seconds or config.steps or 1)
         terminal = show and _is_terminal()
         self._bar = tqdm(
             total=round(self._scale, 1),
@@ -397,8 +395,8 @@ def _interruptible() -> Iterator[list[int]]:
     try:
         yield received
     finally:
-        for number, action in previous.items():
-            signal.signal(number, action)
+        for restored, action in previous.items():
+            signal.signal(restored, action)
 
 
 def _is_terminal() -> bool:

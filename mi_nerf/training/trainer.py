@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,8 @@ import numpy as np
 
 from .. import hull
 from ..data import Dataset
-from ..field import NeuralField, NeuralFieldConfig
+from ..encoding import FourierEncoding
+from ..field import Corner, NeuralField, NeuralFieldConfig
 from ..occupancy import OccupancyGrid, grid_shape
 from ..quadrature import over_background
 from ..volume import Evaluation, MarchSettings, Samples, integrate, place_samples
@@ -44,7 +46,8 @@ def field_config(config: TrainConfig, dataset: Dataset) -> NeuralFieldConfig:
         color = "sigmoid" if dataset.color_space == "srgb" else "exp"
     model = NeuralFieldConfig(
         color_space=dataset.color_space,
-        position=config.position,
+        position=config.position
+        or FourierEncoding(frequencies=resolved_octaves(dataset, lower, upper)),
         direction=config.direction,
         network=config.network,
         density_activation=config.density.activation,
@@ -53,6 +56,19 @@ def field_config(config: TrainConfig, dataset: Dataset) -> NeuralFieldConfig:
         color_activation=color,
     )
     return model.in_box(lower, upper)
+
+
+def resolved_octaves(dataset: Dataset, lower: Corner, upper: Corner) -> int:
+    """The number of octaves L whose finest has a period of two pixels, seen from the middle.
+
+    The box spans [−1, 1], so octave k has a period of 2^(1−k); finer ones would describe
+    what no image shows.
+    """
+    center = (np.asarray(lower) + np.asarray(upper)) / 2
+    distance = np.median(np.linalg.norm(dataset.cam_to_world[:, :3, 3] - center, axis=1))
+    side = max(b - a for a, b in zip(lower, upper, strict=True))
+    pixels = side * dataset.intrinsics.fx / max(float(distance), 1e-9 * side)
+    return int(np.clip(round(math.log2(max(pixels, 2.0))), 1, 12))
 
 
 class Trainer:
@@ -102,7 +118,7 @@ class Trainer:
     def march_settings(self) -> MarchSettings:
         """How rays are sampled in training."""
         s = self.config.sampling
-        return MarchSettings(samples=s.samples, near=s.near, far=s.far, block=s.block)
+        return MarchSettings(samples=s.samples, near=s.near, far=s.far, block=min(s.block, s.batch))
 
     def step(self, learning_rate: float) -> StepResult:
         """One optimisation step. Launches work; reads nothing back but sample counts."""
@@ -131,7 +147,7 @@ class Trainer:
         """Loss over the first ``complete`` rays; gradients end in the field's parameters."""
         self.optimizer.zero_grad()
         evaluation = Evaluation(
-            self.field, samples, self.config.sampling.block, keep=self._keep(samples)
+            self.field, samples, self.march_settings().block, keep=self._keep(samples)
         )
         evaluation.enable_grad()
         seen = integrate(evaluation, samples)
