@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import io
 import os
-import re
 import sys
 import time
 from collections.abc import Sequence
@@ -16,6 +16,7 @@ import tyro
 from .commands import COMMANDS, command_type
 from .errors import InputError
 from .training.run import TrainingError
+from .usage import unknown_command, usage_error
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -43,6 +44,8 @@ def _parse(arguments: list[str]) -> Any:
     """Parses arguments; usage errors become an InputError of one line."""
     if not arguments:
         arguments = ["--help"]
+    if arguments[0] not in COMMANDS and not arguments[0].startswith("-"):
+        raise InputError(unknown_command(arguments[0], COMMANDS))
     message = io.StringIO()
     try:
         with contextlib.redirect_stderr(message):
@@ -56,7 +59,10 @@ def _parse(arguments: list[str]) -> Any:
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        raise InputError(_one_line(message.getvalue())) from None
+        command = COMMANDS.get(arguments[0])
+        fields = dataclasses.fields(command) if command else ()
+        options = ["--" + field.name.replace("_", "-") for field in fields]
+        raise InputError(usage_error(message.getvalue(), arguments, options)) from None
 
 
 def _spread_lists(arguments: list[str]) -> list[str]:
@@ -69,14 +75,6 @@ def _spread_lists(arguments: list[str]) -> list[str]:
         inside = argument == "--set" or (inside and not argument.startswith("-"))
         result.append(argument)
     return result
-
-
-def _one_line(text: str) -> str:
-    """The message in tyro's box, without the box and the colours."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
-    text = re.sub(r"[─│╭╮╰╯┌┐└┘|]+", " ", text)
-    words = " ".join(text.split())
-    return words.removeprefix("Parsing error ").removeprefix("Unrecognized options ").strip()
 
 
 def _fail(message: str, status: int) -> int:

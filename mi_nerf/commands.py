@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +17,8 @@ from .backend import choose_variant
 from .demo import run_demo
 from .errors import InputError
 from .evaluation import evaluate
-from .files import make_folder, write_json
-from .rendering import check_output, run_frames, scene_frames, write_frames
+from .files import check_file, check_folder, make_folder, write_json
+from .rendering import check_output, output_kind, run_frames, scene_frames, write_frames
 from .target import open_target
 from .training import run as training
 from .training.config import with_settings
@@ -43,7 +44,7 @@ class Train:
     mi-nerf train lego/ --out runs/lego --resume
     """
 
-    data: Positional[Path]
+    data: Positional[Annotated[Path, arg(metavar="DATA")]]
     """Folder of a dataset (transforms_train.json and images)."""
     out: Path
     """Folder of the run; created."""
@@ -76,6 +77,8 @@ class Train:
                 config = replace(config, **{name: _positive(name.replace("_", "-"), value)})
         if not self.resume and config.steps is None and config.max_seconds is None:
             config = replace(config, max_seconds=600.0)
+        if self.resume and (self.out / training.CONFIG).exists():
+            self._require_same_settings()
         run = training.start(
             self.data,
             self.out,
@@ -87,6 +90,20 @@ class Train:
         run.train()
         trainer = run.trainer
         print(f"{self.out}: {trainer.step_count} steps in {run.seconds:.0f} s")
+
+    def _require_same_settings(self) -> None:
+        """Refuses options that a resumed run, which keeps its settings, would ignore."""
+        recorded, _ = training.read_config(self.out)
+        wanted = with_settings(recorded, list(self.set))
+        for name, default in (("preset", "nerf"), ("seed", 0), ("downscale", 1)):
+            if getattr(self, name) != default:
+                wanted = replace(wanted, **{name: getattr(self, name)})
+        wanted = replace(wanted, steps=recorded.steps, max_seconds=recorded.max_seconds)
+        if wanted != recorded:
+            raise InputError(
+                f"{self.out}: a resumed run keeps its settings, expected no other --preset, "
+                "--seed, --downscale or --set than it was started with"
+            )
 
 
 @dataclass(frozen=True)
@@ -102,7 +119,7 @@ class Eval:
     mi-nerf eval lego.safetensors --data lego/ --downscale 2
     """
 
-    target: Positional[Path]
+    target: Positional[Annotated[Path, arg(metavar="TARGET")]]
     """A run folder, or a field file (then with --data)."""
     data: Path | None = None
     """Dataset; default: the run's own."""
@@ -127,7 +144,9 @@ class Eval:
             bar.update()
 
         if self.json is not None:
-            make_folder(self.json.parent)
+            check_file(self.json)
+        if self.images is not None:
+            check_folder(self.images)
         with bar:
             record = evaluate(
                 open_target(self.target),
@@ -140,6 +159,7 @@ class Eval:
                 on_image=show,
             )
         if self.json is not None:
+            make_folder(self.json.parent)
             write_json(self.json, record)
         mean = record["mean"]
         print(
@@ -163,7 +183,7 @@ class Render:
     mi-nerf render scene.xml -o scene.exr --spp 64
     """
 
-    target: Positional[Path]
+    target: Positional[Annotated[Path, arg(metavar="TARGET")]]
     """A run folder or a Mitsuba XML scene."""
     out: Annotated[Path, arg(aliases=["-o"])]
     """An .exr, .png or .mp4 file, or a folder of pictures."""
@@ -186,10 +206,19 @@ class Render:
             raise InputError(
                 f"--size {self.size[0]} {self.size[1]}: expected two numbers of at least 1"
             )
-        variant = choose_variant(self.variant)
-        picture = self.out.suffix in (".png", ".exr")
+        if not self.target.exists():
+            raise InputError(
+                f"{self.target}: not found, expected a run folder or a Mitsuba XML scene"
+            )
+        picture = output_kind(self.out) == "picture"
         check_output(self.out, self.frames or 1)
-        if self.target.suffix == ".xml":
+        variant = choose_variant(self.variant)
+        if self.target.suffix.lower() == ".xml":
+            if self.frames is not None and self.path is None:
+                raise InputError(
+                    f"--frames {self.frames}: the sensors of a scene give one frame each, "
+                    "expected --path orbit or --path spiral too"
+                )
             frames = 1 if picture else 60
             count, images = scene_frames(
                 self.target,
@@ -226,7 +255,7 @@ class Info:
     mi-nerf info runs/lego
     """
 
-    target: Positional[Path | None] = None
+    target: Positional[Annotated[Path | None, arg(metavar="TARGET")]] = None
     """A run folder, a .safetensors file or a dataset folder."""
 
     def run(self, _started: float) -> None:
@@ -277,7 +306,7 @@ def command_type(chosen: str | None) -> Any:
 
 
 def _positive(name: str, value: Any) -> Any:
-    if not value > 0:
+    if not 0 < value < math.inf:
         raise InputError(f"--{name} {value}: expected a number above 0")
     return value
 

@@ -85,7 +85,7 @@ def run_demo(
 def _fresh_folder(out: Path | None) -> Path:
     if out is not None:
         if out.exists() and (not out.is_dir() or any(out.iterdir())):
-            raise InputError(f"{out}: not empty, expected a new folder")
+            raise InputError(f"{out}: expected a new or an empty folder")
         return make_folder(out)
     number = 1
     while (folder := Path("mi-nerf-demo" + (f"-{number}" if number > 1 else ""))).exists():

@@ -57,6 +57,7 @@ def evaluate(
     backend = array_module(variant)
     field, occupancy = target.contents.build(backend)
     results: list[dict[str, Any]] = []
+    qualities: list[dict[str, float]] = []
     seconds, queries = [], 0
     for k, name in enumerate(dataset.names):
         start = time.perf_counter()
@@ -71,7 +72,9 @@ def evaluate(
         seconds.append(time.perf_counter() - start)
         queries += view.queries
         predicted = to_8bit(display_image(view, field.color_space))
-        result: dict[str, Any] = {"name": name, **_compare(predicted, reference_image(dataset, k))}
+        quality = _compare(predicted, reference_image(dataset, k))
+        qualities.append(quality)
+        result = {"name": name, **{key: _finite(value) for key, value in quality.items()}}
         results.append(result)
         if folder is not None:
             with replacing(folder / f"{name}.png") as path:
@@ -85,7 +88,7 @@ def evaluate(
         "size": [size.width, size.height],
         "background": "white",
         "views": len(dataset),
-        "mean": {key: _mean([r[key] for r in results]) for key in ("psnr", "ssim")},
+        "mean": {key: _mean([q[key] for q in qualities]) for key in ("psnr", "ssim")},
         "images": results,
         # The first view also compiles kernels; the median does not feel it.
         "seconds_per_view": float(np.median(seconds)),
@@ -108,24 +111,29 @@ def _held_out(
     downscale: int | None,
     views: int | None,
 ) -> Dataset:
-    path = Path(data) if data is not None else target.data
-    if path is None:
-        raise InputError(f"{target.path}: a field file knows no dataset, expected --data")
     if views is not None and views < 1:
         raise InputError(f"--views {views}: expected at least 1")
     scale = target.downscale if downscale is None else downscale
+    if scale < 1:
+        raise InputError(f"--downscale {scale}: expected at least 1")
+    path = Path(data) if data is not None else target.data
+    if path is None:
+        raise InputError(f"{target.path}: a field file knows no dataset, expected --data too")
+    if data is None and not path.exists():
+        raise InputError(f"{path}: the dataset of {target.path} is gone, expected --data")
     return load_dataset(path, split, downscale=scale, limit=views)
 
 
-def _compare(predicted: Image, truth: Image) -> dict[str, float | None]:
-    quality = psnr(predicted, truth)
-    likeness = ssim(predicted, truth)
-    return {
-        "psnr": quality if math.isfinite(quality) else None,
-        "ssim": likeness if math.isfinite(likeness) else None,
-    }
+def _compare(predicted: Image, truth: Image) -> dict[str, float]:
+    return {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
 
 
-def _mean(values: list[float | None]) -> float | None:
-    numbers = [v for v in values if v is not None]
-    return float(np.mean(numbers)) if numbers else None
+def _mean(values: list[float]) -> float | None:
+    """Without the infinite PSNR of identical images; ``None`` where any value is undefined."""
+    numbers = [v for v in values if not math.isinf(v)]
+    return _finite(float(np.mean(numbers))) if numbers else None
+
+
+def _finite(value: float) -> float | None:
+    """JSON knows neither infinity nor NaN."""
+    return value if math.isfinite(value) else None

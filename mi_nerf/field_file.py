@@ -72,15 +72,23 @@ def load_field(path: str | Path) -> FieldFile:
         }
         occupancy = None
         if description["occupancy_shape"] is not None:
-            shape = tuple(description["occupancy_shape"])
-            bits = np.unpackbits(arrays["occupancy"], count=int(np.prod(shape)))
-            occupancy = bits.astype(bool).reshape(shape)
+            occupancy = _unpack(arrays["occupancy"], tuple(description["occupancy_shape"]))
         march = MarchSettings(**description["march"])
         contents = FieldFile(config, weights, occupancy, march, description["provenance"])
-    except (KeyError, TypeError, ValueError) as error:
+    except KeyError as error:
+        raise InputError(f"{path}: damaged field description: {error} is missing") from error
+    except (TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged field description: {error}") from error
-    _check_shapes(path, contents)
+    _check_weights(path, contents)
     return contents
+
+
+def _unpack(packed: np.ndarray[Any, Any], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
+    """(X, Y, Z) booleans from eight to a byte; NumPy would fill up what is missing."""
+    count = int(np.prod(shape))
+    if len(shape) != 3 or min(shape) < 1 or packed.size != -(-count // 8):
+        raise ValueError(f"occupancy of {packed.size} bytes does not fit the shape {shape}")
+    return np.unpackbits(packed, count=count).astype(bool).reshape(shape)
 
 
 def _field_config(data: dict[str, Any]) -> NeuralFieldConfig:
@@ -95,7 +103,7 @@ def _field_config(data: dict[str, Any]) -> NeuralFieldConfig:
     return NeuralFieldConfig(**values)
 
 
-def _check_shapes(path: str | Path, contents: FieldFile) -> None:
+def _check_weights(path: str | Path, contents: FieldFile) -> None:
     shapes = contents.config.shapes()
     found = {name: array.shape for name, array in contents.weights.items()}
     for name in sorted(shapes.keys() | found.keys()):
@@ -103,4 +111,9 @@ def _check_shapes(path: str | Path, contents: FieldFile) -> None:
             raise InputError(
                 f"{path}: tensor '{name}' is {found.get(name, 'missing')}, "
                 f"expected {shapes.get(name, 'no such tensor')}"
+            )
+    for name, array in contents.weights.items():
+        if array.dtype.kind != "f":
+            raise InputError(
+                f"{path}: tensor '{name}' holds {array.dtype}, expected floating-point numbers"
             )

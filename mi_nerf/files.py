@@ -72,13 +72,46 @@ def make_folder(path: str | os.PathLike[str]) -> Path:
         InputError: if that fails.
     """
     folder = Path(path)
+    check_folder(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be created: {error.strerror}") from error
+    return folder
+
+
+def check_folder(path: str | os.PathLike[str]) -> None:
+    """Checks that :func:`make_folder` would succeed, and leaves nothing behind.
+
+    For output that is written only after hours of work.
+
+    Raises:
+        InputError: if the folder cannot be created or written to.
+    """
+    folder = Path(path)
+    existing = folder
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        which = "this" if existing == folder else str(existing)
+        raise InputError(f"{folder}: expected an output folder, but {which} is a file")
+    try:
+        with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
-    return folder
+
+
+def check_file(path: str | os.PathLike[str]) -> None:
+    """Checks that an output file could be written, its folder being created if need be.
+
+    Raises:
+        InputError: if it could not, or is a folder.
+    """
+    file = Path(path)
+    if file.is_dir():
+        raise InputError(f"{file}: expected an output file, this is a folder")
+    check_folder(file.parent)
 
 
 def _umask() -> int:

@@ -85,8 +85,11 @@ def _may_be_seen(
     near = depth - radius
     ahead = near > 1e-6 * radius
     reach = radius / np.where(ahead, near, 1)
-    extent_x, extent_y = reach * intrinsics.fx + 1, reach * intrinsics.fy + 1
     with np.errstate(invalid="ignore", over="ignore"):
+        # How far q can lie from the image of c, |q − c| ≤ r: away from the optical axis
+        # perspective stretches a sphere. |q_x/q_z − c_x/c_z| ≤ r·√(1 + (c_x/c_z)²)/(c_z − r).
+        extent_x = reach * np.hypot(intrinsics.fx, pixel[:, 0] - intrinsics.cx) + 1
+        extent_y = reach * np.hypot(intrinsics.fy, pixel[:, 1] - intrinsics.cy) + 1
         x0, x1 = np.floor(pixel[:, 0] - extent_x), np.ceil(pixel[:, 0] + extent_x)
         y0, y1 = np.floor(pixel[:, 1] - extent_y), np.ceil(pixel[:, 1] + extent_y)
         # A sphere that leaves the picture, or lies behind the camera, is not judged.

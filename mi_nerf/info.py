@@ -64,7 +64,7 @@ def _run(folder: Path) -> str:
         "run": str(folder),
         "preset": config.preset,
         "data": f"{data['path']}, {data['views']} views of {data['size'][0]}x{data['size'][1]}",
-        "variant": record["variant"],
+        "variant": str(record.get("variant", "unknown")),
         "budget": ", ".join(
             f"{v:g} {n}"
             for n, v in (("steps", config.steps), ("seconds", config.max_seconds))
@@ -80,12 +80,17 @@ def _run(folder: Path) -> str:
 
 def _checkpoint_rows(path: Path) -> dict[str, str]:
     _, description = read_tensors(path, kind="checkpoint", version=checkpoint.VERSION)
-    return {
-        "checkpoint": str(path),
-        "step": str(description["step"]),
-        "seconds": f"{description['progress']['seconds']:.0f}",
-        "restarts": str(description["attempt"]),
-    }
+    try:
+        return {
+            "checkpoint": str(path),
+            "step": str(description["step"]),
+            "seconds": f"{description['progress']['seconds']:.0f}",
+            "restarts": str(description["attempt"]),
+        }
+    except KeyError as error:
+        raise InputError(f"{path}: damaged checkpoint: {error} is missing") from error
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: damaged checkpoint: {error}") from error
 
 
 def _field_rows(path: Path, contents: FieldFile) -> dict[str, str]:
@@ -108,7 +113,14 @@ def _field_rows(path: Path, contents: FieldFile) -> dict[str, str]:
 
 def _dataset(folder: Path) -> str:
     rows = {"dataset": str(folder)}
-    for split in available_splits(folder):
+    try:
+        splits = available_splits(folder)
+    except InputError:
+        raise InputError(
+            f"{folder}: expected a run with its {CONFIG}, or a dataset with "
+            "transforms_{train,val,test}.json"
+        ) from None
+    for split in splits:
         dataset = load_dataset(folder, split)
         size = dataset.intrinsics
         alpha = "RGBA" if dataset.has_alpha else "RGB"

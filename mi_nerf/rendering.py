@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +18,7 @@ from .cameras import Intrinsics
 from .color import linear_to_srgb, srgb_to_linear
 from .data import Dataset, available_splits, load_dataset
 from .errors import InputError
-from .files import make_folder, replacing
+from .files import check_file, check_folder, make_folder, replacing
 from .images import write_exr
 from .target import Target
 from .trajectory import orbit_like, spiral_like
@@ -26,7 +28,9 @@ Image = np.ndarray[Any, Any]
 Path_ = Literal["orbit", "spiral", "test"]
 Frames = Iterator[tuple[str, Image]]  # name and (H, W, 4) linear premultiplied RGBA
 
-PICTURES, VIDEOS = (".png", ".exr"), (".mp4",)
+Output = Literal["picture", "video", "folder"]
+
+_KINDS: dict[str, Output] = {"": "folder", ".png": "picture", ".exr": "picture", ".mp4": "video"}
 
 
 def run_frames(
@@ -100,9 +104,17 @@ def scene_frames(
             film["film.size"] = list(size)
             film.update()
 
+    def render(sensor: Any, seed: int = 0) -> Image:
+        try:
+            return _rgba(mi.render(scene, sensor=sensor, spp=spp, seed=seed), sensor.film())
+        except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
+            if isinstance(error.__cause__, InputError):
+                raise InputError(f"{scene_path}: {error.__cause__}") from error
+            raise
+
     def still() -> Frames:
         for i, sensor in enumerate(sensors):
-            yield f"sensor_{i:03d}", _render_scene(scene, sensor, spp)
+            yield f"sensor_{i:03d}", render(sensor)
 
     if path is None:
         return len(sensors), still()
@@ -110,7 +122,7 @@ def scene_frames(
         raise InputError(
             f"{scene_path}: a scene has no test views, expected --path orbit or spiral"
         )
-    return frames, _moving(scene, sensors[0], path, frames, spp)
+    return frames, _moving(scene, sensors[0], path, frames, render)
 
 
 def load_scene(path: str | Path) -> Any:
@@ -124,10 +136,22 @@ def load_scene(path: str | Path) -> Any:
     if not Path(path).is_file():
         raise InputError(f"{path}: not found, expected a run folder or a Mitsuba XML scene")
     try:
-        return mi.load_file(str(path))
+        scene = mi.load_file(str(path))
     except Exception as error:  # Mitsuba raises RuntimeError for all that can be wrong
-        message = " ".join(str(error).split())
+        message = _without_traceback(str(error))
         raise InputError(f"{path}: Mitsuba cannot load this scene: {message}") from error
+    if not isinstance(scene, mi.Scene):
+        raise InputError(f"{path}: expected <scene> as the outermost element")
+    return scene
+
+
+def _without_traceback(message: str) -> str:
+    """One line: of a Python plugin's traceback in it, only what the exception says."""
+    before, found, traceback = message.partition("Traceback (most recent call last):")
+    if found:
+        said = re.findall(r"^[\w.]*(?:Error|Exception): (.*)", traceback, re.MULTILINE)
+        message = before + (said[-1] if said else traceback)
+    return " ".join(message.split())
 
 
 def write_frames(
@@ -149,37 +173,53 @@ def write_frames(
     target = Path(out)
     check_output(target, count)
 
+    first = next(frames)  # before the folder is made: this is where scenes fail
+
     def counted() -> Frames:
-        for item in frames:
+        for item in itertools.chain([first], frames):
             yield item
             if on_frame is not None:
                 on_frame()
 
-    if target.suffix in PICTURES:
-        for _, image in counted():
-            write_picture(target, image)
-    elif target.suffix in VIDEOS:
+    kind = output_kind(target)
+    folder = make_folder(target if kind == "folder" else target.parent)
+    if kind == "video":
         _write_video(target, counted(), fps)
-    else:
-        folder = make_folder(target)
-        for name, image in counted():
-            write_picture(folder / f"{name}.png", image)
+        return
+    for name, image in counted():
+        write_picture(target if kind == "picture" else folder / f"{name}.png", image)
+
+
+def output_kind(out: Path) -> Output:
+    """What to write, by the name.
+
+    Raises:
+        InputError: for names that end like files of another kind.
+    """
+    if out.is_dir():
+        return "folder"
+    if out.suffix.lower() not in _KINDS:
+        raise InputError(
+            f"{out}: expected an .exr, .png or .mp4 file, or a folder without a dot in its name"
+        )
+    return _KINDS[out.suffix.lower()]
 
 
 def check_output(target: Path, count: int) -> None:
-    """Refuses output names that cannot hold ``count`` frames."""
-    if target.suffix in PICTURES and count != 1:
-        raise InputError(f"{target}: {count} frames, expected an .mp4 or a folder (or --frames 1)")
-    if target.suffix and target.suffix not in PICTURES + VIDEOS:
-        raise InputError(f"{target}: expected an .exr, .png or .mp4 file or a folder")
-    if target.suffix:
-        make_folder(target.parent)
+    """Refuses names that cannot hold ``count`` frames or cannot be written to."""
+    kind = output_kind(target)
+    if kind == "picture" and count != 1:
+        raise InputError(f"{target}: one picture for {count} frames, expected an .mp4 or a folder")
+    if kind == "folder":
+        check_folder(target)
+    else:
+        check_file(target)
 
 
 def write_picture(path: Path, image: Image) -> None:
     """Writes (H, W, 4) linear premultiplied RGBA as ``.exr`` or ``.png``."""
     with replacing(path) as temporary:
-        if path.suffix == ".exr":
+        if path.suffix.lower() == ".exr":
             write_exr(temporary, image)
         else:
             alpha = np.clip(image[..., 3:], 0, 1)
@@ -191,9 +231,14 @@ def write_picture(path: Path, image: Image) -> None:
 
 def _write_video(target: Path, frames: Frames, fps: int) -> None:
     with replacing(target) as temporary:
-        writer = imageio.get_writer(temporary, fps=fps, macro_block_size=2, quality=8)
+        writer = imageio.get_writer(
+            temporary, format="FFMPEG", fps=fps, macro_block_size=1, quality=8
+        )
         with writer:
             for _, image in frames:
+                # Players want even sizes: an odd one grows by a copy of its last row or column.
+                height, width = image.shape[:2]
+                image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
                 straight = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
                 encoded = linear_to_srgb(straight) * image[..., 3:] + 1 - image[..., 3:]
                 writer.append_data(np.rint(np.clip(encoded, 0, 1) * 255).astype(np.uint8))
@@ -237,31 +282,21 @@ def _linear_rgba(color: Image, opacity: Image, color_space: str) -> Image:
     return np.concatenate([color, alpha], axis=-1).astype(np.float32)
 
 
-def _render_scene(scene: Any, sensor: Any, spp: int, seed: int = 0) -> Image:
-    """``mi.render``, with what the user can mend said by an InputError."""
+def _rgba(image: Any, film: Any) -> Image:
+    """The colour channels of a Mitsuba image, opaque where the film has no alpha."""
     import mitsuba as mi
 
-    try:
-        return _bitmap_rgba(mi.render(scene, sensor=sensor, spp=spp, seed=seed))
-    except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
-        if isinstance(error.__cause__, InputError):
-            raise error.__cause__ from None
-        raise
+    pixels = np.array(image).reshape(*image.shape[:2], -1)
+    base = film.base_channels_count()  # what follows are AOVs
+    has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
+    alpha = pixels[..., base - 1 : base] if has_alpha else np.ones_like(pixels[..., :1])
+    color = pixels[..., : base - has_alpha]
+    return np.concatenate([np.broadcast_to(color, (*color.shape[:2], 3)), alpha], axis=-1)
 
 
-def _bitmap_rgba(image: Any) -> Image:
-    """The colour channels of a Mitsuba image, opaque where the film has no alpha."""
-    pixels = np.array(image)
-    if pixels.ndim == 2:
-        pixels = pixels[..., None]
-    if pixels.shape[-1] < 3:
-        pixels = np.repeat(pixels[..., :1], 3, axis=-1)
-    if pixels.shape[-1] == 3:
-        pixels = np.concatenate([pixels, np.ones_like(pixels[..., :1])], axis=-1)
-    return pixels[..., :4]
-
-
-def _moving(scene: Any, sensor: Any, path: Path_, frames: int, spp: int) -> Frames:
+def _moving(
+    scene: Any, sensor: Any, path: Path_, frames: int, render: Callable[[Any, int], Image]
+) -> Frames:
     """Moves a sensor around the scene's box, at its own distance and height."""
     import mitsuba as mi
 
@@ -276,7 +311,7 @@ def _moving(scene: Any, sensor: Any, path: Path_, frames: int, spp: int) -> Fram
         matrix = mi.ScalarTransform4f(mitsuba_from_opengl(pose))
         parameters["to_world"] = mi.Transform4f(matrix)
         parameters.update()
-        yield f"{path}_{i:03d}", _render_scene(scene, sensor, spp, seed=i)
+        yield f"{path}_{i:03d}", render(sensor, i)
 
 
 def _aim(pose: Image, center: Image) -> Image:

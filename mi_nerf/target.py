@@ -19,16 +19,12 @@ class Target:
     path: Path
     contents: FieldFile
     record: dict[str, Any] | None  # config.json of the run; None for a lone field file
+    downscale: int = 1  # the scale at which the run saw its images
 
     @property
     def data(self) -> Path | None:
         """The dataset of the run."""
         return None if self.record is None else Path(self.record["data"]["path"])
-
-    @property
-    def downscale(self) -> int:
-        """The scale at which the run saw its images."""
-        return 1 if self.record is None else int(self.record["settings"]["downscale"])
 
     @property
     def train_seconds(self) -> float | None:
@@ -51,11 +47,11 @@ def open_target(path: str | Path) -> Target:
     target = Path(path)
     if target.is_dir():
         if not (target / CONFIG).exists():
-            raise InputError(f"{target}: no {CONFIG}, expected the folder of a run")
-        _, record = read_config(target)
+            raise InputError(f"{target}: no {CONFIG} in it, expected the folder of a run")
+        config, record = read_config(target)
         if not (target / FIELD).exists():
             raise InputError(f"{target}: no {FIELD} yet, expected a run with a checkpoint")
-        return Target(target, load_field(target / FIELD), record)
+        return Target(target, load_field(target / FIELD), record, config.downscale)
     if not target.exists():
         raise InputError(f"{target}: not found, expected a run folder or a field file")
     return Target(target, load_field(target), None)

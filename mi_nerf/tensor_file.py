@@ -30,7 +30,7 @@ def write_tensors(
         "description": json.dumps(description),
     }
     with replacing(path) as temporary:
-        save_file({n: np.ascontiguousarray(a) for n, a in arrays.items()}, temporary, metadata)
+        save_file({n: np.asarray(a, order="C") for n, a in arrays.items()}, temporary, metadata)
 
 
 def read_tensors(path: str | Path, *, kind: str, version: int) -> tuple[Arrays, dict[str, Any]]:
@@ -51,9 +51,12 @@ def read_tensors(path: str | Path, *, kind: str, version: int) -> tuple[Arrays, 
     try:
         with safe_open(path, framework="numpy") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-        return arrays, json.loads(metadata["description"])
-    except (SafetensorError, OSError, ValueError, KeyError) as error:
-        raise InputError(f"{path}: damaged: {error}") from error
+        description = json.loads(metadata.get("description", ""))
+    except (SafetensorError, OSError, ValueError) as error:
+        raise InputError(f"{path}: damaged {kind} file: {error}") from error
+    if not isinstance(description, dict):
+        raise InputError(f"{path}: damaged {kind} file: its description is no JSON object")
+    return arrays, description
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:

@@ -121,6 +121,7 @@ class Evaluation:
         self._graph: list[tuple[Any, Any, list[Any]]] = []
         float_type = type(samples.t)
         self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4)]
+        dr.make_opaque(self._channels)  # without queries they would stay constants
         for where, valid in self._blocks():
             if keep:
                 outputs = self._query(where)
@@ -156,7 +157,8 @@ class Evaluation:
             outputs = outputs or self._query(where)
             for value, gradient in zip(outputs, gradients, strict=True):
                 if dr.grad_enabled(value):
-                    dr.set_grad(value, dr.gather(type(value), gradient, where, valid))
+                    # Added up: a grey field may return one array for all channels.
+                    dr.accum_grad(value, dr.gather(type(value), gradient, where, valid))
                     dr.enqueue(dr.ADMode.Backward, value)
             dr.traverse(dr.ADMode.Backward)
             dr.eval([dr.grad(p) for p in self._field.parameters().values()])
@@ -167,7 +169,8 @@ class Evaluation:
         tangents = [dr.zeros(type(c), len(c)) for c in self._channels]
         for where, valid in self._blocks():
             outputs = self._query(where)
-            dr.forward_to(outputs, flags=dr.ADFlag.ClearInterior)
+            # One output may be computed from another: keep the tangents of all.
+            dr.forward_to(outputs, flags=dr.ADFlag.ClearNone)
             for tangent, value in zip(tangents, outputs, strict=True):
                 dr.scatter(tangent, dr.grad(value), where, valid)
             dr.eval(tangents)

@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 from PIL import Image
 
-from mi_nerf.cameras import look_at
+from mi_nerf.cameras import Intrinsics, look_at
 
 
 def write_blender_dataset(
@@ -56,3 +56,31 @@ def orbit_poses(n: int, radius: float = 4.0, height: float = 1.0) -> np.ndarray:
     return np.stack(
         [look_at((radius * np.cos(a), radius * np.sin(a), height), (0, 0, 0)) for a in angles]
     )
+
+
+def blob_images(poses: np.ndarray, size: int, angle_x: float) -> np.ndarray:
+    """A ball of radius 0.8 with a soft edge, coloured by its normal, straight RGBA uint8."""
+    camera = Intrinsics.from_angle_x(size, size, angle_x)
+    y, x = np.mgrid[:size, :size] + 0.5
+    local = np.stack(
+        [(x - camera.cx) / camera.fx, (camera.cy - y) / camera.fy, -np.ones_like(x)], axis=-1
+    )
+    images = []
+    for pose in poses:
+        d = local @ pose[:3, :3].T
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        o = pose[:3, 3]
+        b = d @ o
+        depth = 0.64 - (o @ o - b * b)  # below 0 where the ray misses
+        normal = (o - d * (b + np.sqrt(np.maximum(depth, 0)))[..., None]) / 0.8
+        alpha = np.clip(depth / 0.1, 0, 1)[..., None]
+        images.append(np.concatenate([np.clip(0.5 + 0.5 * normal, 0, 1), alpha], axis=-1))
+    return np.rint(255 * np.array(images)).astype(np.uint8)
+
+
+def write_blob_dataset(folder: Path, *, train: int = 8, test: int = 5, size: int = 24) -> Path:
+    """A dataset of the blob in two splits, with cameras at two heights; returns ``folder``."""
+    for split, count, height in (("train", train, 1.0), ("test", test, 1.5)):
+        poses = orbit_poses(count, height=height)
+        write_blender_dataset(folder, blob_images(poses, size, 0.6), poses, 0.6, split)
+    return folder

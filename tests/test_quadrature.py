@@ -119,6 +119,14 @@ def test_nothing_seen(ad: Any) -> None:
     assert list(seen.color[0]) == list(seen.opacity) == list(seen.depth) == [0, 0]
 
 
+@pytest.mark.parametrize("sigma", [1e-30, 1e-10, 1e-3, 1.0])
+def test_depth_needs_no_opacity(ad: Any, sigma: float) -> None:
+    """It is the mean of t, however little there is to be seen."""
+    t, delta = ad.Float([1, 2, 3, 10]), dr.full(ad.Float, 1, 4)
+    density = ad.Float([0, sigma, 0, 0])
+    assert composite(density, [], t, delta, 4).depth[0] == pytest.approx(2, rel=1e-6)
+
+
 def test_nan_is_not_hidden(ad: Any) -> None:
     """A spoilt density must show in the loss, where the trainer looks for it."""
     density = ad.Float([1, np.nan, 1, 1])

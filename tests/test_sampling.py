@@ -61,7 +61,7 @@ def test_rays_that_meet_faces_edges_and_corners(ad: Any) -> None:
     o, d = origins[pairs // len(directions)], directions[pairs % len(directions)]
     near, far, hit = fast_interval(ad, o, d)
     slow = [slow_interval(*ray, LOWER, UPPER) for ray in zip(o, d, strict=True)]
-    assert hit.tolist() == [interval is not None for interval in slow]
+    assert np.array_equal(hit, [interval is not None for interval in slow])
     assert 1000 < hit.sum() < 5000
     bounds = np.array([(0, 0) if interval is None else interval for interval in slow], float)
     assert np.array_equal(np.stack([near, far], 1), bounds)

@@ -60,10 +60,8 @@ def cube_to_world(shape: mi.Shape) -> np.ndarray[Any, Any]:
     solution, *_ = np.linalg.lstsq(source, target[:, :3], rcond=None)
     to_world = np.eye(4)
     to_world[:3] = solution.T
-    size = np.linalg.norm(to_world[:3, :3], axis=0)
-    if not np.all(np.isfinite(to_world)) or abs(np.linalg.det(to_world[:3, :3])) <= 1e-6 * float(
-        np.prod(np.maximum(size, 1e-30))
-    ):
+    stretch = np.linalg.svd(to_world[:3, :3], compute_uv=False)
+    if not stretch[-1] > 1e-6 * stretch[0]:  # also catches NaN
         raise InputError("nerfmedium: the cube's to_world is singular, expected a volume")
     return to_world
 

@@ -65,6 +65,8 @@ def load_checkpoint(path: str | Path, trainer: Trainer) -> dict[str, Any]:
         trainer.step_count = description["step"]
         trainer.rays_per_step = description["rays_per_step"]
         progress: dict[str, Any] = description["progress"]
-    except (KeyError, ValueError) as error:
+    except KeyError as error:
+        raise InputError(f"{path}: does not fit this run: {error} is missing") from error
+    except (TypeError, ValueError) as error:
         raise InputError(f"{path}: does not fit this run: {error}") from error
     return progress

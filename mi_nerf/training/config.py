@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import json
-import types
-import typing
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -13,6 +12,7 @@ from ..activations import ColorActivation, DensityActivation
 from ..encoding import FourierEncoding
 from ..errors import InputError
 from ..network import NetworkConfig
+from .plain import assign, build, leaf_names, require
 
 
 @dataclass(frozen=True)
@@ -22,6 +22,9 @@ class DensityConfig:
     activation: DensityActivation = "softplus"
     shift: float = -1.0  # added before the activation (softplus(x − 1): mip-NeRF)
     gain: float = 1.0  # density of activation output 1, per half side of the box
+
+    def __post_init__(self) -> None:
+        require(self, "gain", above=0)
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,11 @@ class OccupancyConfig:
     queries: int = 8192  # cells looked at in one refresh
     start: int = 256  # steps before the first refresh
 
+    def __post_init__(self) -> None:
+        require(self, "resolution every queries", at_least=1)
+        require(self, "threshold start", at_least=0)
+        require(self, "decay", at_least=0, at_most=1)
+
 
 @dataclass(frozen=True)
 class SamplingConfig:
@@ -51,6 +59,17 @@ class SamplingConfig:
     far: float | None = None
     block: int = 16384  # queries the network evaluates at a time
 
+    def __post_init__(self) -> None:
+        require(self, "samples render_samples batch max_rays rays block", at_least=1)
+        require(self, "near", at_least=0)
+        require(self, "far", above=0)
+        if self.batch < self.samples:
+            raise ValueError(
+                f"batch={self.batch}, expected at least the samples={self.samples} of one ray"
+            )
+        if self.near is not None and self.far is not None and self.near >= self.far:
+            raise ValueError(f"near={self.near}, expected less than far={self.far}")
+
 
 @dataclass(frozen=True)
 class OptimizerConfig:
@@ -62,6 +81,11 @@ class OptimizerConfig:
     beta1: float = 0.9
     beta2: float = 0.99
     epsilon: float = 1e-8
+
+    def __post_init__(self) -> None:
+        require(self, "lr lr_final epsilon", above=0)
+        require(self, "warmup", at_least=0)
+        require(self, "beta1 beta2", at_least=0, below=1)
 
 
 @dataclass(frozen=True)
@@ -91,6 +115,16 @@ class TrainConfig:
     max_skipped: int = 20  # non-finite steps in a row that end the run
     store_activations: float = 6.0  # GiB of activations kept for the backward pass
 
+    def __post_init__(self) -> None:
+        require(self, "seed", at_least=0, below=1 << 31)
+        require(self, "steps downscale max_skipped", at_least=1)
+        require(self, "max_seconds", above=0)
+        require(self, "report_every checkpoint_every", at_least=0)
+        require(self, "collapse_check max_restarts store_activations", at_least=0)
+        box = self.box or (0, 0, 0, 1, 1, 1)
+        if not all(box[i] < box[i + 3] for i in range(3)):
+            raise ValueError(f"box={self.box}, expected three minima below three maxima")
+
 
 def to_json(config: TrainConfig) -> dict[str, Any]:
     """The configuration as plain JSON values."""
@@ -101,110 +135,53 @@ def to_json(config: TrainConfig) -> dict[str, Any]:
 def from_json(data: dict[str, Any], source: str) -> TrainConfig:
     """Rebuilds a configuration; ``source`` names the file in error messages."""
     try:
-        config: TrainConfig = _build(TrainConfig, data)
-    except (TypeError, ValueError, KeyError) as error:
+        config: TrainConfig = build(TrainConfig, data)
+    except ValueError as error:
         raise InputError(
             f"{source}: not a training configuration of this version: {error}"
         ) from error
     return config
 
 
-def _build(cls: Any, data: dict[str, Any]) -> Any:
-    hints = typing.get_type_hints(cls)
-    values = {}
-    for key, value in data.items():
-        nested = _nested(hints[key])
-        if nested is not None and value is not None:
-            value = _build(nested, value)
-        elif isinstance(value, list):
-            value = tuple(value)
-        values[key] = value
-    return cls(**values)
-
-
 def with_settings(config: TrainConfig, assignments: list[str]) -> TrainConfig:
     """Applies ``key=value`` assignments; nested settings as ``network.width=128``.
+
+    Their order does not matter to settings that depend on each other.
 
     Raises:
         InputError: for an unknown key, a value of the wrong kind or out of range.
     """
+    values = dataclasses.asdict(config)
     for assignment in assignments:
         key, separator, text = assignment.partition("=")
         if not separator:
             raise InputError(f"--set {assignment}: expected key=value")
-        config = _assign(config, key.split("."), text, assignment)
-    return config
-
-
-def setting_names(config: Any = None, prefix: str = "") -> list[str]:
-    """All keys that ``--set`` accepts."""
-    config = TrainConfig() if config is None else config
-    names = []
-    for f in dataclasses.fields(config):
-        nested = _nested(typing.get_type_hints(type(config))[f.name])
-        if nested is not None:
-            names += setting_names(nested(), f"{prefix}{f.name}.")
-        else:
-            names.append(prefix + f.name)
-    return names
-
-
-def _assign(config: Any, path: list[str], text: str, assignment: str) -> Any:
-    name, rest = path[0], path[1:]
-    hints = typing.get_type_hints(type(config))
-    nested = _nested(hints[name]) if name in hints else None
-    if name not in hints or bool(rest) != (nested is not None):
-        raise InputError(
-            f"--set {assignment}: unknown setting, expected one of {', '.join(setting_names())}"
-        )
-    if nested is not None:
-        value = _assign(getattr(config, name) or nested(), rest, text, assignment)
-    else:
-        value = _parse(text, hints[name], assignment)
+        if key == "preset":  # would change the name and nothing else
+            raise InputError(f"--set {assignment}: expected --preset {text}")
+        try:
+            assign(values, TrainConfig, key.split("."), text)
+        except KeyError:
+            raise InputError(f"--set {assignment}: unknown setting, {_similar(key)}") from None
+        except ValueError as error:
+            raise InputError(f"--set {assignment}: {error}") from None
     try:
-        return dataclasses.replace(config, **{name: value})
+        result: TrainConfig = build(TrainConfig, values)
     except ValueError as error:
-        raise InputError(f"--set {assignment}: {error}") from error
+        names = [a for a in assignments if f"{a.partition('=')[0].split('.')[-1]}=" in str(error)]
+        raise InputError(f"--set {' '.join(names or assignments)}: {error}") from error
+    return result
 
 
-def _nested(hint: Any) -> Any:
-    """The dataclass that a setting holds, or may hold; ``None`` for plain values."""
-    for option in (hint, *typing.get_args(hint)):
-        if dataclasses.is_dataclass(option):
-            return option
-    return None
+def setting_names() -> list[str]:
+    """All keys that ``--set`` accepts."""
+    return [name for name in leaf_names(TrainConfig) if name != "preset"]
 
 
-def _parse(text: str, hint: Any, assignment: str) -> Any:
-    """Reads ``text`` as the type ``hint``."""
-    options = typing.get_args(hint)
-    origin = typing.get_origin(hint)
-    if origin is Literal:
-        if text in options:
-            return text
-        raise InputError(f"--set {assignment}: expected one of {', '.join(options)}")
-    if origin in (typing.Union, types.UnionType):
-        if type(None) in options and text.lower() in ("none", "null"):
-            return None
-        for option in options:
-            if option is type(None):
-                continue
-            try:
-                return _parse(text, option, assignment)
-            except InputError as error:
-                failure = error
-        raise failure
-    try:
-        if hint is bool:
-            return {"true": True, "1": True, "false": False, "0": False}[text.lower()]
-        if origin is tuple:
-            values = tuple(float(part) for part in text.split(","))
-            if len(values) != len(options):
-                raise ValueError
-            return values
-        return hint(text)
-    except (ValueError, KeyError):
-        name = getattr(hint, "__name__", str(hint))
-        if origin is tuple:
-            name = f"{len(options)} numbers separated by commas"
-        raise InputError(f"--set {assignment}: expected {name}") from None
+def _similar(key: str) -> str:
+    """What the user may have meant instead of an unknown key."""
+    names = setting_names()
+    group = key.partition(".")[0] + "."
+    close = difflib.get_close_matches(key, names, n=3)
+    close = close or [n for n in names if n.split(".")[-1] == key.split(".")[-1]]
+    close = close or [n for n in names if n.startswith(group)]
+    return f"expected {'for example ' if close else 'one of '}{', '.join(close or names)}"

@@ -78,8 +78,18 @@ class Adam:
         self._renew(name, value)
 
     def restore(self, state: Mapping[str, np.ndarray[Any, Any]]) -> None:
-        """Takes up the result of :meth:`state`."""
+        """Takes up the result of :meth:`state`.
+
+        Raises:
+            KeyError: if a tensor is missing.
+            ValueError: if a tensor is of another shape.
+        """
         for name, tensor in self._parameters.items():
+            for moment in (f"first.{name}", f"second.{name}"):
+                if state[moment].shape != tensor.shape:
+                    raise ValueError(
+                        f"tensor '{moment}' is {state[moment].shape}, expected {tensor.shape}"
+                    )
             self._first[name] = upload(type(tensor), state[f"first.{name}"])
             self._second[name] = upload(type(tensor), state[f"second.{name}"])
         self._steps = upload(type(self._steps), state["steps"])

@@ -18,7 +18,7 @@ def nerf() -> TrainConfig:
     """A Fourier-feature MLP made fast on the machine at hand (the default)."""
     return TrainConfig(
         preset="nerf",
-        network=NetworkConfig(depth=2, width=128, skip=-1, feature_layer=False, view_width=32),
+        network=NetworkConfig(depth=2, width=256, skip=-1, feature_layer=False, view_width=32),
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
         sampling=SamplingConfig(batch=4096),

@@ -7,6 +7,7 @@ import math
 import platform
 import signal
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -22,7 +23,7 @@ from ..backend import array_module
 from ..data import Dataset, load_dataset
 from ..errors import InputError
 from ..field_file import FieldFile, save_field
-from ..files import make_folder, read_json, write_json
+from ..files import check_folder, make_folder, read_json, write_json
 from ..volume import MarchSettings
 from .checkpoint import load_checkpoint, save_checkpoint
 from .config import TrainConfig, from_json, to_json
@@ -63,6 +64,8 @@ class Run:
         self._skipped_in_row = 0
         self._attempt_start = 0
         self._since = _Meter()
+        # Squared errors of the last steps, as many as tell a collapse from bad luck.
+        self._recent: deque[float] = deque(maxlen=max(1, min(100, config.collapse_check // 2)))
         self._pending: StepResult | None = None
 
     @property
@@ -83,9 +86,14 @@ class Run:
     def resume(self) -> None:
         """Goes back to the checkpoint of the folder, and cuts the log to match."""
         state = load_checkpoint(self.folder / CHECKPOINT, self.trainer)
-        self._before = state["seconds"]
-        self._skipped = state["skipped"]
-        self._attempt_start = state["attempt_start"]
+        try:
+            self._before = float(state["seconds"])
+            self._skipped = int(state["skipped"])
+            self._attempt_start = int(state["attempt_start"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(
+                f"{self.folder / CHECKPOINT}: damaged description of the progress: {error}"
+            ) from error
         _cut_log(self.folder / LOG, self.trainer.step_count)
 
     def train(self, show_bar: bool = True) -> None:
@@ -156,7 +164,9 @@ class Run:
             return
         if result.accepted[0]:
             self._skipped_in_row = 0
-            self._since.add(float(result.loss[0]), float(result.mse[0]), result)
+            mse = float(result.mse[0])
+            self._since.add(float(result.loss[0]), mse, result)
+            self._recent.append(mse)
             return
         self._skipped += 1
         self._skipped_in_row += 1
@@ -171,9 +181,9 @@ class Run:
     def _collapsed(self) -> bool:
         """Whether the field is still no better than empty space when it should be."""
         age = self.trainer.step_count - self._attempt_start
-        if age != self.config.collapse_check or self._since.recent is None:
+        if age != self.config.collapse_check or not self._recent:
             return False
-        return self._since.recent > 0.95 * self._blank
+        return float(np.mean(self._recent)) > 0.9 * self._blank
 
     def _restart(self) -> None:
         self._settle()
@@ -187,6 +197,7 @@ class Run:
         self._write({"event": "restart", "attempt": self.trainer.attempt, "reason": "collapse"})
         self.trainer.reset()
         self._since = _Meter()
+        self._recent.clear()
 
     # ---------------------------------- Reports ----------------------------------
 
@@ -199,7 +210,7 @@ class Run:
             "occupied": 1.0 if occupancy is None else occupancy.fraction(),
             "skipped": self._skipped,
         }
-        self._since = _Meter(self._since.recent)
+        self._since = _Meter()
         return self._write(line)
 
     def _write(self, line: dict[str, Any]) -> dict[str, Any]:
@@ -212,8 +223,7 @@ class Run:
 class _Meter:
     """Means over the steps since the last report."""
 
-    def __init__(self, recent: float | None = None) -> None:
-        self.recent = recent  # running mean of the squared error, across reports
+    def __init__(self) -> None:
         self._losses: list[float] = []
         self._errors: list[float] = []
         self._rays = self._queries = 0
@@ -224,7 +234,6 @@ class _Meter:
         self._errors.append(mse)
         self._rays += result.rays
         self._queries += result.queries
-        self.recent = mse if self.recent is None else self.recent + 0.02 * (mse - self.recent)
 
     def summary(self) -> dict[str, Any]:
         elapsed = max(time.monotonic() - self._start, 1e-9)
@@ -295,12 +304,14 @@ def start(
     folder = Path(out)
     if resume and (folder / CONFIG).exists():
         config = _resumed_config(folder, config, data)
+    elif resume and (folder / CHECKPOINT).exists():
+        raise InputError(f"{folder}: no {CONFIG} beside the {CHECKPOINT}, expected both")
     elif (folder / CONFIG).exists() or (folder / CHECKPOINT).exists():
         raise InputError(f"{folder}: already holds a run, expected --resume or another folder")
+    check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale)
-    make_folder(folder)
-    dr.set_flag(dr.JitFlag.Debug, False)
     run = Run(folder, config, dataset, variant, started=started)
+    make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
         run.resume()
     else:
@@ -319,14 +330,17 @@ def read_config(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
     record = read_json(path, "the config.json of a run")
     if not isinstance(record, dict) or "settings" not in record:
         raise InputError(f"{path}: no 'settings', expected the config.json of a run")
+    data = record.get("data")
+    if not isinstance(data, dict) or not {"path", "views", "size"} <= data.keys():
+        raise InputError(f"{path}: no 'data', expected the config.json of a run")
     return from_json(record["settings"], str(path)), record
 
 
 def _resumed_config(folder: Path, given: TrainConfig, data: str | Path) -> TrainConfig:
     config, record = read_config(folder)
-    recorded = record.get("data", {}).get("path")
-    if recorded is not None and Path(recorded) != Path(data).resolve():
-        raise InputError(f"{data}: the run in {folder} was trained on {recorded}")
+    recorded = record["data"]["path"]
+    if Path(recorded) != Path(data).resolve():
+        raise InputError(f"{data}: expected {recorded}, on which the run in {folder} was trained")
     if given.steps is not None or given.max_seconds is not None:
         config = replace(config, steps=given.steps, max_seconds=given.max_seconds)
     return config

@@ -1,0 +1,98 @@
+"""Resident memory: over many training steps, and of one large frame through mi.render.
+
+    python -m tests.benchmarks.memory
+
+Prints resident megabytes every 200 of 2000 steps of the preset ``nerf``, the number of
+kernels compiled in the last 1000 of them, and the peak while Mitsuba renders 800x800
+pixels of the published 8x256 network with 64 samples a ray.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import mi_nerf
+from mi_nerf.backend import array_module, choose_variant
+from mi_nerf.cameras import Intrinsics, look_at, sensor_dict
+from mi_nerf.network import initial_weights
+from mi_nerf.training.presets import preset
+from mi_nerf.training.trainer import Trainer
+from mi_nerf.volume import MarchSettings
+from tests.benchmarks import machine, resident_megabytes
+from tests.benchmarks.published_step import synthetic_views
+
+
+def main() -> None:
+    """Prints both tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--size", type=int, default=800)
+    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--variant")
+    options = parser.parse_args()
+    variant = choose_variant(options.variant)
+    print(machine())
+    if options.steps:
+        _training(variant, options.steps)
+    if options.size:
+        _frame(variant, options.size, options.samples)
+
+
+def _training(variant: str, steps: int) -> None:
+    trainer = Trainer(preset("nerf"), synthetic_views(), array_module(variant))
+    misses = 0
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    for step in range(1, steps + 1):
+        trainer.step(1e-3)
+        history = dr.kernel_history()
+        if step > steps // 2:
+            misses += sum(k.get("cache_hit") == 0 for k in history)
+        if step % max(1, steps // 10) == 0:
+            dr.sync_thread()
+            print(f"step {step}: {resident_megabytes():.0f} MB", flush=True)
+    dr.set_flag(dr.JitFlag.KernelHistory, False)
+    print(f"kernels compiled in the last {steps - steps // 2} steps: {misses}")
+
+
+def _frame(variant: str, size: int, samples: int) -> None:
+    mi.set_variant(variant)
+    config = mi_nerf.NeuralFieldConfig()
+    contents = mi_nerf.FieldFile(
+        config, initial_weights(config.shapes(), 0), march=MarchSettings(samples=samples)
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "field.safetensors"
+        mi_nerf.save_field(path, contents)
+        camera = Intrinsics.from_angle_x(size, size, 0.6911)
+        scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": "nerf"},
+                "sensor": sensor_dict(camera, look_at((0, -4, 1), (0, 0, 0))),
+                "box": {
+                    "type": "cube",
+                    "interior": {"type": "nerfmedium", "filename": str(path)},
+                },
+            }
+        )
+    before = resident_megabytes()
+    start = time.perf_counter()
+    image = np.array(mi.render(scene, spp=1))
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    print(
+        f"{size}x{size}, {samples} samples a ray, 8x256: {time.perf_counter() - start:.0f} s, "
+        f"peak {peak:.0f} MB resident ({before:.0f} MB before), "
+        f"mean alpha {image[..., 3].mean():.2f}"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Seconds of a training step of the published 8x256 network.
+
+    python -m tests.benchmarks.published_step
+
+One step of 1024 rays with 256 queries each: forward, backward, Adam. Prints the median
+of some steps after a warm-up, the arithmetic rate (3.49 MFLOP a query), and the rate of
+a plain matrix product of the same shape for comparison.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import drjit as dr
+import numpy as np
+
+from mi_nerf.backend import array_module, choose_variant
+from mi_nerf.cameras import Intrinsics, look_at
+from mi_nerf.data import Dataset
+from mi_nerf.training.config import with_settings
+from mi_nerf.training.presets import preset
+from mi_nerf.training.trainer import Trainer
+from tests.benchmarks import machine, resident_megabytes
+
+RAYS, SAMPLES = 1024, 256
+FLOP_PER_QUERY = 3.49e6
+
+
+def synthetic_views() -> Dataset:
+    """Noise seen by cameras whose rays all cross the box."""
+    camera = Intrinsics.from_angle_x(64, 64, 0.3)
+    poses = np.stack([look_at((4 * np.cos(a), 4 * np.sin(a), 1), (0, 0, 0)) for a in range(6)])
+    images = np.random.default_rng(0).random((6, 64, 64, 4)).astype(np.float32)
+    images[..., 3] = 1
+    return Dataset(Path("."), "train", tuple("abcdef"), images, "srgb", False, poses, camera)
+
+
+def main() -> None:
+    """Times the step."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=5)
+    parser.add_argument("--variant")
+    options = parser.parse_args()
+    backend = array_module(choose_variant(options.variant))
+    settings = [f"sampling.rays={RAYS}", f"sampling.samples={SAMPLES}", "box=-1,-1,-1,1,1,1"]
+    trainer = Trainer(with_settings(replace(preset("paper")), settings), synthetic_views(), backend)
+    seconds = []
+    for step in range(options.steps + 1):
+        start = time.perf_counter()
+        result = trainer.step(5e-4)
+        dr.sync_thread()
+        if step:  # the first one compiles
+            seconds.append(time.perf_counter() - start)
+    queries = result.queries
+    rate = queries * FLOP_PER_QUERY / np.median(seconds) / 1e9
+    print(machine())
+    print(
+        f"{result.rays} rays, {queries} queries, {trainer.field_config.parameter_count()} weights"
+    )
+    print(
+        f"step: median {np.median(seconds):.2f} s, {min(seconds):.2f} to {max(seconds):.2f} s, "
+        f"{rate:.0f} GFLOP/s, {resident_megabytes() / 1e3:.1f} GB resident"
+    )
+    print(f"plain matrix product 256x256x16384: {_product_rate(backend):.0f} GFLOP/s")
+
+
+def _product_rate(backend: object) -> float:
+    tensor = backend.TensorXf  # type: ignore[attr-defined]
+    rng = np.random.default_rng(0)
+    a, b = (tensor(rng.random((256, n), np.float32)) for n in (256, 16384))
+    best = np.inf
+    for _ in range(20):
+        start = time.perf_counter()
+        dr.eval(a @ b)
+        dr.sync_thread()
+        best = min(best, time.perf_counter() - start)
+    return 2 * 256 * 256 * 16384 / best / 1e9
+
+
+if __name__ == "__main__":
+    main()

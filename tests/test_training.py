@@ -1,0 +1,376 @@
+"""Training steps, runs, and what happens when they go wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import drjit.llvm.ad as ad
+import numpy as np
+import pytest
+
+from mi_nerf.data import Dataset, load_dataset
+from mi_nerf.errors import InputError
+from mi_nerf.field_file import load_field
+from mi_nerf.quadrature import over_background
+from mi_nerf.training import run as training
+from mi_nerf.training.batches import step_rng
+from mi_nerf.training.config import OptimizerConfig, TrainConfig, with_settings
+from mi_nerf.training.presets import preset
+from mi_nerf.training.run import TrainingError
+from mi_nerf.training.schedule import learning_rate
+from mi_nerf.training.trainer import Trainer, resolved_octaves
+from mi_nerf.volume import Evaluation, integrate, place_samples, render_rays
+from tests.datasets import orbit_poses, write_blender_dataset
+
+SIZE, VIEWS, ANGLE = 20, 6, 0.7
+SMALL = [
+    "network.width=16",
+    "network.view_width=8",
+    "sampling.batch=1024",
+    "sampling.samples=24",
+    "occupancy.resolution=16",
+    "occupancy.start=8",
+    "occupancy.every=4",
+    "occupancy.queries=512",
+]
+
+
+def ball_images(poses: np.ndarray) -> np.ndarray:
+    """A ball of radius 0.6 at the origin, coloured by its normal, (n, SIZE, SIZE, 4) uint8."""
+    focal = SIZE / 2 / np.tan(ANGLE / 2)
+    y, x = np.mgrid[:SIZE, :SIZE] + 0.5
+    local = np.stack([(x - SIZE / 2) / focal, (SIZE / 2 - y) / focal, -np.ones_like(x)], -1)
+    images = []
+    for pose in poses:
+        d = local @ pose[:3, :3].T
+        d /= np.linalg.norm(d, axis=-1, keepdims=True)
+        o = pose[:3, 3]
+        b = d @ o
+        root = b * b - o @ o + 0.36
+        hit = root > 0
+        normal = (o + d * (-b - np.sqrt(np.maximum(root, 0)))[..., None]) / 0.6
+        image = np.concatenate([0.5 + 0.5 * normal, np.ones_like(x)[..., None]], -1)
+        images.append(np.where(hit[..., None], image, 0))
+    return np.rint(np.clip(images, 0, 1) * 255).astype(np.uint8)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ball")
+    poses = orbit_poses(VIEWS, height=1.5)
+    write_blender_dataset(folder, ball_images(poses), poses, ANGLE, split="train")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def views(data: Path) -> Dataset:
+    return load_dataset(data, "train")
+
+
+def small(*settings: str, **changes: Any) -> TrainConfig:
+    return replace(with_settings(preset("nerf"), SMALL + list(settings)), **changes)
+
+
+def weights_after(trainer: Trainer, steps: int, rate: float = 5e-3) -> dict[str, np.ndarray]:
+    for _ in range(steps):
+        trainer.step(rate)
+    return trainer.field.weights()
+
+
+# --------------------------------------------------------------------------
+#   Steps
+# --------------------------------------------------------------------------
+
+
+def test_a_small_field_learns_the_ball(views: Dataset) -> None:
+    trainer = Trainer(small(), views, ad)
+    first = float(trainer.step(1e-2).mse[0])
+    for _ in range(250):
+        result = trainer.step(1e-2)
+    assert float(result.mse[0]) < 0.1 * first
+    assert 0 < trainer.occupancy.fraction() < 1
+
+
+def test_steps_depend_on_the_seed_alone(views: Dataset) -> None:
+    runs = [weights_after(Trainer(small(seed=s), views, ad), 12) for s in (0, 0, 1)]
+    for name, expected in runs[0].items():
+        np.testing.assert_array_equal(runs[1][name], expected)
+    assert any(np.abs(runs[2][n] - w).max() > 0 for n, w in runs[0].items())
+
+
+@pytest.mark.parametrize("background", ["white", "black", "random"])
+def test_backgrounds(views: Dataset, background: str) -> None:
+    trainer = Trainer(small(f"background={background}"), views, ad)
+    assert np.isfinite(float(trainer.step(1e-2).loss[0]))
+
+
+def test_incomplete_rays_do_not_count(views: Dataset) -> None:
+    """Rays that lost samples to the budget leave no trace in loss and gradient."""
+    config = small("sampling.rays=64", "sampling.batch=100000", "occupancy.enabled=False")
+    whole = Trainer(config, views, ad)
+    cut = Trainer(with_settings(config, ["sampling.batch=700"]), views, ad)
+    loss = [float(t.step(0.0).loss[0]) for t in (whole, cut)]
+    assert loss[0] != loss[1]
+    # The same by hand: the rays before the cut, each with all of its samples.
+    rng = step_rng(ad.Float, config.seed, 0)
+    batch = cut._source.draw(64, rng)
+    jitter = rng.random(ad.Float, 64 * config.sampling.samples)
+    samples = place_samples(cut.field, batch.o, batch.d, cut.march_settings(), jitter=jitter)
+    complete = samples.truncate(700)
+    assert 0 < complete < 64
+    seen = integrate(Evaluation(cut.field, samples, 1024), samples)
+    predicted = over_background(seen.color, seen.opacity, batch.background)
+    target = over_background(batch.color, batch.alpha, batch.background)
+    error = sum(np.square(np.array(p - t)) for p, t in zip(predicted, target, strict=True)) / 3
+    assert loss[1] == pytest.approx(error[:complete].mean(), rel=1e-5)
+
+
+def test_no_kernel_is_compiled_in_a_steady_state(data: Path, tmp_path: Path) -> None:
+    """In a process of its own, whose kernel cache starts empty."""
+    script = f"""
+import sys
+sys.path.insert(0, {str(Path.cwd())!r})
+import drjit as dr, drjit.llvm.ad as ad
+from mi_nerf.data import load_dataset
+from mi_nerf.training.trainer import Trainer
+from tests.test_training import small
+trainer = Trainer(small(), load_dataset({str(data)!r}, "train"), ad)
+for _ in range(60):
+    trainer.step(1e-2)
+dr.set_flag(dr.JitFlag.KernelHistory, True)
+dr.kernel_history_clear()
+sizes = set()
+for _ in range(40):
+    result = trainer.step(1e-2)
+    sizes.add((result.rays, result.queries))
+history = [k for k in dr.kernel_history() if k.get("cache_hit") is not None]
+print(len(sizes), len(history), sum(not k["cache_hit"] for k in history))
+"""
+    environment = {**os.environ, "HOME": str(tmp_path)}
+    output = subprocess.run(
+        [sys.executable, "-c", script],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    sizes, kernels, misses = map(int, output.stdout.split())
+    assert sizes > 5 and kernels > 1000  # batches did change in size
+    assert misses == 0
+
+
+def test_memory_stays_flat(views: Dataset) -> None:
+    trainer = Trainer(small(), views, ad)
+    weights_after(trainer, 100)
+    before = resident_bytes()
+    weights_after(trainer, 300)
+    assert resident_bytes() - before < 20e6
+
+
+def resident_bytes() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+# --------------------------------------------------------------------------
+#   Failures
+# --------------------------------------------------------------------------
+
+
+def test_non_finite_steps_are_skipped(views: Dataset, tmp_path: Path) -> None:
+    broken = views.images.copy()
+    broken[0, 8:12, 8:12] = np.nan
+    trainer = Trainer(small(), replace(views, images=broken), ad)
+    skipped = 0
+    for _ in range(30):
+        before = trainer.field.weights()
+        result = trainer.step(1e-2)
+        if not result.accepted[0]:
+            skipped += 1
+            for name, value in trainer.field.weights().items():
+                np.testing.assert_array_equal(value, before[name])
+    assert skipped > 0
+    assert all(np.isfinite(w).all() for w in trainer.field.weights().values())
+
+
+def test_too_many_skipped_steps_end_the_run(data: Path, tmp_path: Path) -> None:
+    run = training.start(data, tmp_path / "run", small(steps=100, max_skipped=5), "llvm_ad_rgb")
+    for name, tensor in run.trainer.field.parameters().items():
+        run.trainer.optimizer.assign(name, tensor * dr.nan)
+    with pytest.raises(TrainingError, match="not finite in 5 steps in a row"):
+        run.train(show_bar=False)
+
+
+def test_a_collapsed_run_restarts_and_says_so(data: Path, tmp_path: Path) -> None:
+    config = small(
+        "density.activation=relu",
+        "density.shift=-50",
+        steps=400,
+        collapse_check=40,
+        max_restarts=2,
+    )
+    run = training.start(data, tmp_path / "run", config, "llvm_ad_rgb")
+    with pytest.raises(TrainingError, match="collapsed 3 times"):
+        run.train(show_bar=False)
+    log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
+    assert [line["attempt"] for line in log if line.get("event") == "restart"] == [1, 2]
+
+
+def test_a_healthy_run_does_not_restart(data: Path, tmp_path: Path) -> None:
+    config = small(steps=210, collapse_check=200)
+    run = training.start(data, tmp_path / "run", config, "llvm_ad_rgb")
+    run.train(show_bar=False)
+    assert run.trainer.attempt == 0
+
+
+# --------------------------------------------------------------------------
+#   Runs
+# --------------------------------------------------------------------------
+
+
+def test_resuming_is_exact(data: Path, tmp_path: Path) -> None:
+    through = training.start(data, tmp_path / "a", small(steps=40), "llvm_ad_rgb")
+    through.train(show_bar=False)
+
+    # The schedule follows the budget, so the interrupted run gets the full one, too.
+    halves = training.start(data, tmp_path / "b", small(steps=40), "llvm_ad_rgb")
+    for _ in range(17):
+        halves._advance()
+    halves._settle()
+    halves.save()
+    resumed = training.start(data, tmp_path / "b", small(), "llvm_ad_rgb", resume=True)
+    assert resumed.trainer.step_count == 17
+    resumed.train(show_bar=False)
+
+    assert resumed.trainer.step_count == through.trainer.step_count == 40
+    for name, expected in through.trainer.field.weights().items():
+        np.testing.assert_array_equal(resumed.trainer.field.weights()[name], expected)
+    np.testing.assert_array_equal(
+        resumed.trainer.occupancy.mask(), through.trainer.occupancy.mask()
+    )
+
+
+def test_a_run_folder_holds_what_it_should(data: Path, tmp_path: Path) -> None:
+    run = training.start(data, tmp_path / "run", small(steps=20), "llvm_ad_rgb")
+    run.train(show_bar=False)
+    names = {p.name for p in (tmp_path / "run").iterdir()}
+    assert names == {"config.json", "checkpoint.safetensors", "field.safetensors", "log.jsonl"}
+    line = json.loads((tmp_path / "run/log.jsonl").read_text().splitlines()[-1])
+    assert {"step", "seconds", "loss", "psnr", "samples_per_ray", "learning_rate"} <= set(line)
+    assert line["step"] == 20
+    config, record = training.read_config(tmp_path / "run")
+    assert config == run.config and record["versions"]["mitsuba"]
+
+
+def test_an_existing_run_is_not_overwritten(data: Path, tmp_path: Path) -> None:
+    training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb").train(show_bar=False)
+    before = (tmp_path / "run/checkpoint.safetensors").read_bytes()
+    with pytest.raises(InputError, match="already holds a run, expected --resume"):
+        training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb")
+    assert (tmp_path / "run/checkpoint.safetensors").read_bytes() == before
+
+
+def test_a_run_killed_before_its_first_checkpoint_starts_over(data: Path, tmp_path: Path) -> None:
+    training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb")
+    run = training.start(data, tmp_path / "run", small(), "llvm_ad_rgb", resume=True)
+    run.train(show_bar=False)
+    assert run.trainer.step_count == 5
+
+
+def test_the_log_is_cut_back_to_the_checkpoint(data: Path, tmp_path: Path) -> None:
+    training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb").train(show_bar=False)
+    log = tmp_path / "run/log.jsonl"
+    kept = log.read_text()
+    log.write_text(kept + '{"step": 9, "seconds": 1}\n{"step": 1')  # killed while writing
+    run = training.start(data, tmp_path / "run", small(steps=8), "llvm_ad_rgb", resume=True)
+    assert log.read_text() == kept
+    run.train(show_bar=False)
+    assert json.loads(log.read_text().splitlines()[-1])["step"] == 8
+
+
+def test_ctrl_c_saves_and_the_run_goes_on(data: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "mi_nerf.cli", "train", str(data), "--out"]
+    command += [str(tmp_path / "run"), "--steps", "100000", "--set", *SMALL, "report_every=0.1"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    log = tmp_path / "run/log.jsonl"
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline and not (log.exists() and log.read_text().count("\n") > 2):
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0, errors
+    assert "Traceback" not in errors
+    stopped = training.start(data, tmp_path / "run", small(), "llvm_ad_rgb", resume=True)
+    assert stopped.trainer.step_count > 0
+    last = json.loads(log.read_text().splitlines()[-1])
+    assert stopped.trainer.step_count == last["step"]
+
+
+def test_max_seconds_counts_from_the_given_start(data: Path, tmp_path: Path) -> None:
+    started = time.monotonic() - 100.0
+    config = small(max_seconds=101.0)
+    run = training.start(data, tmp_path / "run", config, "llvm_ad_rgb", started=started)
+    run.train(show_bar=False)
+    assert 101.0 <= run.seconds < 115.0
+
+
+# --------------------------------------------------------------------------
+#   Pieces
+# --------------------------------------------------------------------------
+
+
+def test_learning_rate() -> None:
+    options = OptimizerConfig(lr=1e-2, lr_final=1e-4, warmup=10)
+    assert learning_rate(options, 0.0, 0) == pytest.approx(1e-3)
+    assert learning_rate(options, 0.0, 9) == pytest.approx(1e-2)
+    assert learning_rate(options, 0.5, 500) == pytest.approx(1e-3)
+    assert learning_rate(options, 1.0, 10**6) == pytest.approx(1e-4)
+    assert learning_rate(replace(options, warmup=0), 0.0, 0) == pytest.approx(1e-2)
+
+
+def test_octaves_follow_the_resolution(views: Dataset) -> None:
+    box = ((-1.0,) * 3, (1.0,) * 3)
+    coarse = resolved_octaves(views, *box)
+    fine = replace(
+        views,
+        images=np.zeros((VIEWS, 4 * SIZE, 4 * SIZE, 4), np.float32),
+        intrinsics=replace(
+            views.intrinsics,
+            width=4 * SIZE,
+            height=4 * SIZE,
+            fx=4 * views.intrinsics.fx,
+            fy=4 * views.intrinsics.fy,
+            cx=4 * views.intrinsics.cx,
+            cy=4 * views.intrinsics.cy,
+        ),
+    )
+    assert resolved_octaves(fine, *box) == coarse + 2
+
+
+def test_recomputed_activations_give_the_same_step(views: Dataset) -> None:
+    kept = weights_after(Trainer(small(), views, ad), 3)
+    recomputed = weights_after(Trainer(small("store_activations=0"), views, ad), 3)
+    for name, expected in kept.items():
+        np.testing.assert_allclose(recomputed[name], expected, atol=1e-5)
+
+
+def test_the_field_file_takes_the_occupancy_along(data: Path, tmp_path: Path) -> None:
+    run = training.start(data, tmp_path / "run", small(steps=80), "llvm_ad_rgb")
+    run.train(show_bar=False)
+    field, occupancy = load_field(tmp_path / "run/field.safetensors").build(ad)
+    o = ad.Array3f(0, 0, 4) + dr.zeros(ad.Array3f, 16)
+    d = ad.Array3f(0, 0, -1) + dr.zeros(ad.Array3f, 16)
+    march = run.trainer.march_settings()
+    loaded = render_rays(field, o, d, march, occupancy=occupancy)
+    trained = render_rays(run.trainer.field, o, d, march, occupancy=run.trainer.occupancy)
+    assert loaded.queries == trained.queries < render_rays(field, o, d, march).queries
+    np.testing.assert_array_equal(np.array(loaded.opacity), np.array(trained.opacity))
