@@ -16,7 +16,7 @@ from . import info
 from .backend import choose_variant
 from .demo import run_demo
 from .errors import InputError
-from .evaluation import evaluate
+from .evaluation import evaluate, quality
 from .files import check_file, check_folder, make_folder, write_json
 from .rendering import check_output, output_kind, run_frames, scene_frames, write_frames
 from .target import open_target
@@ -161,11 +161,9 @@ class Eval:
         if self.json is not None:
             make_folder(self.json.parent)
             write_json(self.json, record)
-        mean = record["mean"]
         print(
             f"{record['split']}, {record['views']} views of {record['size'][0]}x"
-            f"{record['size'][1]}: PSNR {_number(mean['psnr'], '.2f')} dB, "
-            f"SSIM {_number(mean['ssim'], '.4f')}, "
+            f"{record['size'][1]}: {quality(record)}, "
             f"{record['seconds_per_view']:.2f} s and {record['queries_per_ray']:.1f} queries a ray"
         )
 
@@ -320,7 +318,3 @@ def _seed(value: int) -> int:
 def _bar(name: str, unit: str, total: int | None = None) -> tqdm[Any]:
     """A progress bar on a terminal; nothing elsewhere."""
     return tqdm(desc=name, unit=unit, total=total, disable=not sys.stderr.isatty())
-
-
-def _number(value: float | None, form: str) -> str:
-    return "n/a" if value is None else format(value, form)

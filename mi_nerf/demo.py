@@ -18,7 +18,7 @@ from .backend import array_module
 from .cameras import Intrinsics, look_at, sensor_dict
 from .data import load_dataset
 from .errors import InputError
-from .evaluation import evaluate, reference_image
+from .evaluation import evaluate, quality, reference_image
 from .files import make_folder, replacing, write_json
 from .metrics import to_8bit
 from .rendering import load_scene, write_picture
@@ -63,7 +63,9 @@ def run_demo(
     _trace_dataset(folder / "data", variant, views, size, spp, seed)
     print(f"2/4  training for {seconds:.0f} s")
     config = replace(preset("nerf"), seed=seed, max_seconds=seconds)
-    training.start(folder / "data", folder / "run", config, variant).train()
+    run = training.start(folder / "data", folder / "run", config, variant)
+    run.train()
+    spent = run.seconds
     print("3/4  evaluating held-out views")
     target = open_target(folder / "run")
     record = evaluate(target, variant, split="test")
@@ -71,10 +73,8 @@ def run_demo(
     print("4/4  drawing the comparison")
     _draw_comparison(folder, target, variant)
     _write_scene(folder / "scene.xml", size)
-    mean = record["mean"]
     print(
-        f"\nheld-out PSNR {mean['psnr']:.2f} dB, SSIM {mean['ssim']:.3f} "
-        f"after {record['train_seconds']:.0f} s of training; "
+        f"\nheld-out {quality(record)} after {spent:.0f} s of training; "
         f"{time.monotonic() - clock:.0f} s in all\n"
         f"comparison: {folder / 'comparison.png'} (truth, reconstruction, 5 x error)\n"
         f"in Mitsuba: mi-nerf render {folder / 'scene.xml'} -o field.png"

@@ -72,9 +72,9 @@ def evaluate(
         seconds.append(time.perf_counter() - start)
         queries += view.queries
         predicted = to_8bit(display_image(view, field.color_space))
-        quality = _compare(predicted, reference_image(dataset, k))
-        qualities.append(quality)
-        result = {"name": name, **{key: _finite(value) for key, value in quality.items()}}
+        figures = _compare(predicted, reference_image(dataset, k))
+        qualities.append(figures)
+        result = {"name": name, **{key: _finite(value) for key, value in figures.items()}}
         results.append(result)
         if folder is not None:
             with replacing(folder / f"{name}.png") as path:
@@ -96,6 +96,15 @@ def evaluate(
         "train_seconds": target.train_seconds,
         "parameters": target.contents.config.parameter_count(),
     }
+
+
+def quality(record: dict[str, Any]) -> str:
+    """The mean PSNR and SSIM of a record of :func:`evaluate`, for people."""
+    psnr_mean, ssim_mean = record["mean"]["psnr"], record["mean"]["ssim"]
+    return (
+        f"PSNR {'n/a' if psnr_mean is None else format(psnr_mean, '.2f')} dB, "
+        f"SSIM {'n/a' if ssim_mean is None else format(ssim_mean, '.4f')}"
+    )
 
 
 def reference_image(dataset: Dataset, index: int) -> Image:

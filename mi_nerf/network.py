@@ -89,12 +89,47 @@ def initial_weights(
     return result
 
 
-def _layer(weights: dict[str, Any], name: str, x: Any, extra: dict[str, Any]) -> Any:
+class _AddBias(dr.CustomOp):
+    """``y + bias`` on the columns of a tensor, optionally followed by the ReLU.
+
+    The adjoint of Dr.Jit's broadcast adds to the bias atomically, in an order that
+    depends on the threads; summing rows instead makes training reproducible bit by bit.
+    Fused with the ReLU, only its result is kept for the backward pass.
+    """
+
+    def eval(self, y: Any, bias: Any, rectify: bool) -> Any:
+        """The ``(features, N)`` sum."""
+        z = y + dr.reshape(bias, (bias.shape[0], 1))
+        z = relu(z) if rectify else z
+        self._active = z if rectify else None
+        return z
+
+    def forward(self) -> None:
+        """Tangents of both inputs, added."""
+        bias = self.grad_in("bias")
+        self.set_grad_out(self._mask(self.grad_in("y") + dr.reshape(bias, (bias.shape[0], 1))))
+
+    def backward(self) -> None:
+        """The gradient itself, and the sum of its rows."""
+        gradient = self._mask(self.grad_out())
+        self.set_grad_in("y", gradient)
+        self.set_grad_in("bias", dr.sum(gradient, axis=1))
+
+    def name(self) -> str:
+        """Shown in Dr.Jit's graphs."""
+        return "AddBias"
+
+    def _mask(self, gradient: Any) -> Any:
+        return gradient if self._active is None else dr.select(self._active > 0, gradient, 0)
+
+
+def _layer(
+    weights: dict[str, Any], name: str, x: Any, extra: dict[str, Any], *, rectify: bool = False
+) -> Any:
     y = weights[f"{name}.weight"] @ x
     for kind, value in extra.items():
         y = y + weights[f"{name}.{kind}"] @ value
-    bias = weights[f"{name}.bias"]
-    return y + dr.reshape(bias, (bias.shape[0], 1))
+    return dr.custom(_AddBias, y, weights[f"{name}.bias"], rectify)
 
 
 def trunk(config: NetworkConfig, weights: dict[str, Any], position: Any) -> Any:
@@ -102,7 +137,7 @@ def trunk(config: NetworkConfig, weights: dict[str, Any], position: Any) -> Any:
     h = position
     for i in range(config.depth):
         extra = {"position_weight": position} if i == config.skip else {}
-        h = relu(_layer(weights, f"trunk_{i}", h, extra))
+        h = _layer(weights, f"trunk_{i}", h, extra, rectify=True)
     return h
 
 
@@ -117,7 +152,7 @@ def color_head(config: NetworkConfig, weights: dict[str, Any], h: Any, direction
         h = _layer(weights, "feature", h, {})
     seen = {"direction_weight": direction} if config.view_dependent else {}
     for i in range(config.view_depth):
-        h = relu(_layer(weights, f"view_{i}", h, seen if i == 0 else {}))
+        h = _layer(weights, f"view_{i}", h, seen if i == 0 else {}, rectify=True)
     raw = _layer(weights, "color", h, seen if config.view_depth == 0 else {})
     flat, count = raw.array, raw.shape[1]
     float_type = type(flat)

@@ -42,11 +42,13 @@ def usage_error(box: str, arguments: list[str], options: list[str]) -> str:
         kinds = found[2].strip("{}").split()
         kind = _KINDS.get(kinds[0], kinds[0])
         expected = f"a {kind}" if len(kinds) == 1 else f"{len(kinds)} {kind}s"
+        if "," in kinds[0]:
+            expected = f"one of {kinds[0].replace(',', ', ')}"
         return f"{found[1]} {_values(arguments, found[1])}: expected {expected}"
     if found := re.search(r"invalid choice (\S+) for argument '(\S+?)'. .*one of \((.*?)\)", text):
         choices = [c for c in re.findall(r"'(.+?)'", found[3]) if c != "None"]
         return f"{found[2]} {found[1].strip(chr(39))}: expected one of {', '.join(sorted(choices))}"
-    if found := re.search(r"Missing value for argument '(\S+?)'", text):
+    if found := re.search(r"Missing value for argument \W*?(--[\w-]+)", text):
         return f"{found[1]}: expected a value, {hint}"
     return f"{text}, {hint}"
 

@@ -126,6 +126,7 @@ LONG = "/a/very/long/path/that/fits/in/no/line/of/a/terminal/of/eighty/columns/a
         ("render {run} -o {out} --size 10", "--size 10: expected 2 whole numbers"),
         ("render {run} -o {out} --size 1 2 3", "--size 1 2 3: expected 2 whole numbers"),
         ("render {run} -o {out} --path up", "--path up: expected one of orbit, spiral, test"),
+        ("render {run} -o {out} --path None", "--path None: expected one of orbit, spiral, test"),
         # ---- Values out of range ----
         ("train {data} --out {out} --steps 0", "--steps 0: expected a number above 0"),
         ("train {data} --out {out} --max-seconds -1", "--max-seconds -1.0: expected a number"),

@@ -237,6 +237,7 @@ def test_missing_keys_get_their_defaults() -> None:
         ({"seed": -1}, "seed=-1, expected a number of at least 0"),
         ({"loss": "l1"}, "loss='l1', expected one of auto, mse, relative"),
         ({"occupancy": {"enabled": 1}}, "enabled=1, expected true or false"),
+        ({"optimizer": {"lr": True}}, "lr=True, expected a number"),
         ({"optimizer": {"lr": float("nan")}}, "lr=nan, expected a number"),
         ({"box": [1, 2, 3]}, "box=(1, 2, 3), expected 6 numbers"),
         ({"box": [0, 0, 0, 1, 1, "1"]}, "expected 6 numbers"),

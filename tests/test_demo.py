@@ -28,7 +28,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     folder = tmp_path_factory.mktemp("demo")  # empty folders are welcome
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
-        record = run_demo(folder, choose_variant(), seconds=1, views=VIEWS, size=20, spp=4)
+        record = run_demo(folder, choose_variant(), seconds=3, views=VIEWS, size=20, spp=4)
     return folder, record, text.getvalue()
 
 
@@ -43,7 +43,6 @@ def test_everything_is_there(demo: tuple[Path, dict[str, Any], str]) -> None:
     }
     assert json.loads((folder / "eval.json").read_text()) == record
     assert (record["views"], record["size"]) == (2, [20, 20])
-    assert record["train_seconds"] >= 1
     assert f"{record['mean']['psnr']:.2f} dB" in text
     for part in ("1/4", "2/4", "3/4", "4/4", str(folder / "comparison.png")):
         assert part in text

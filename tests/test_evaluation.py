@@ -13,7 +13,12 @@ from PIL import Image
 from safetensors import safe_open
 from safetensors.numpy import save_file
 
+from mi_nerf import evaluation, load_field
+from mi_nerf.backend import array_module, choose_variant
+from mi_nerf.cameras import Intrinsics
 from mi_nerf.cli import main
+from mi_nerf.color import linear_to_srgb
+from mi_nerf.views import render_view
 from tests.datasets import blob_images, orbit_poses, write_blender_dataset, write_exr
 from tests.fields import small_file
 
@@ -189,6 +194,9 @@ def test_nan_is_not_averaged_away(run: Path, tmp_path: Path) -> None:
     save_file(arrays, path, metadata)
     broken = evaluate(run, tmp_path, "--views", "2")
     assert broken["mean"] == {"psnr": None, "ssim": None}
+    assert evaluation._mean([math.inf, 20.0, 30.0]) == 25
+    assert evaluation._mean([math.inf, 20.0, math.nan]) is None
+    assert evaluation._mean([math.inf]) is None
 
 
 # ---- Linear images ------------------------------------------------------------------
@@ -217,4 +225,17 @@ def test_linear_images_are_compared_in_srgb(field_space: str, tmp_path: Path) ->
     record = evaluate(field, tmp_path, "--data", data, "--images", tmp_path / "pictures")
     for i, truth in enumerate(truths):
         found = slow_psnr(tmp_path / "pictures" / f"r_{i}.png", truth)
-        assert record["images"][i]["psnr"] == pytest.approx(found, abs=1e-4)
+        assert record["images"][i]["psnr"] == pytest.approx(found, abs=1e-6)
+
+    # A linear field is put on white before its colours are encoded.
+    contents = load_field(field)
+    module = array_module(choose_variant())
+    built, _ = contents.build(module)
+    camera = Intrinsics.from_angle_x(24, 24, 0.6)
+    view = render_view(built, camera, poses[1], contents.march, module)
+    assert view.opacity.max() > 0.1
+    expected = view.color + 1 - view.opacity[..., None]
+    if field_space == "linear":
+        expected = linear_to_srgb(np.clip(expected, 0, 1))
+    picture = np.asarray(Image.open(tmp_path / "pictures" / "r_1.png")) / 255
+    assert picture == pytest.approx(np.clip(expected, 0, 1), abs=0.5 / 255 + 1e-5)

@@ -96,15 +96,28 @@ def test_nothing_opaque_is_carved(
     assert mask[x, y, z].all()
 
 
-def test_spheres_away_from_the_axis_stay_whole() -> None:
-    """Perspective stretches what lies at the edge of a wide picture."""
-    camera = Intrinsics.from_angle_x(400, 400, 2.2)
-    pose = look_at((0, -1.6, 0), (0, 0, 0))[None]
-    for x in np.linspace(-1, 1, 41):
-        sphere = np.array([[x * 0.9, 0.9, 0.3, 0.02]])
-        mask = carve(silhouettes(sphere, pose, camera), LOWER, UPPER, 6)
-        points = inside_spheres(np.random.default_rng(0), sphere, 200)
-        assert mask[tuple(cells_of(points, mask.shape).T)].all()
+def test_cells_at_the_edge_of_a_wide_picture_reach_far() -> None:
+    """Perspective stretches what lies away from the axis: a cell's corners must not get lost."""
+    rng = np.random.default_rng(2)
+    camera = Intrinsics.from_angle_x(300, 300, 2.3)
+    pose = look_at((0, 0, 0), (0, 0, -1), (0, 1, 0))[None]
+    dataset = silhouettes(np.zeros((0, 4)), pose, camera)
+    judged = 0
+    for _ in range(200):
+        lower = rng.uniform((-1.6, -1.6, -1.2), (1.4, 1.4, -0.9))
+        upper = lower + rng.uniform(0.05, 0.3, 3)
+        box = tuple(lower.tolist()), tuple(upper.tolist())
+        dataset.images[:] = 0
+        if carve(dataset, *box, 1).any():
+            continue  # it leaves the picture
+        judged += 1
+        corners = np.where(rng.integers(0, 2, (8, 3)), lower, upper)
+        pixels, _ = project(corners, camera, pose[0])
+        for x, y in np.floor(pixels).astype(int):
+            dataset.images[0, y, x] = 1
+            assert carve(dataset, *box, 1).all()
+            dataset.images[0, y, x] = 0
+    assert judged > 60
 
 
 def test_most_empty_space_is_carved() -> None:

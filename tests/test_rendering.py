@@ -268,7 +268,7 @@ def test_all_sensors_of_a_scene(
     assert "a.png: one picture for 2 frames" in refused("render", path, "-o", tmp_path / "a.png")
 
 
-@pytest.mark.parametrize("aovs", ["", '<string name="aovs" value="depth,opacity"/>'])
+@pytest.mark.parametrize("aovs", ["", '<string name="aovs" value="opacity,depth"/>'])
 @pytest.mark.parametrize("pixels", ["rgb", "rgba", "luminance", "luminance_alpha"])
 def test_pixel_formats(aovs: str, pixels: str, scene: Callable[..., Path], tmp_path: Path) -> None:
     expected = read_exr(render(scene(), tmp_path / "a.exr"))
