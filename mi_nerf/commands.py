@@ -89,7 +89,8 @@ class Train:
         )
         run.train()
         trainer = run.trainer
-        print(f"{self.out}: {trainer.step_count} steps in {run.seconds:.0f} s")
+        hint = "" if run.progress >= 1 else "; stopped early, go on with --resume"
+        print(f"{self.out}: {trainer.step_count} steps in {run.seconds:.0f} s{hint}")
 
     def _require_same_settings(self) -> None:
         """Refuses options that a resumed run, which keeps its settings, would ignore."""

@@ -43,7 +43,7 @@ def run_demo(
     seed: int = 0,
     views: dict[str, int] | None = None,
     size: int = 128,
-    spp: int = 64,
+    spp: int = 128,
 ) -> dict[str, Any]:
     """Path-traces a small dataset, trains on it, evaluates held-out views, compares.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,13 @@ def test_plugins_survive_variant_switches(field: Path) -> None:
     np.testing.assert_array_equal(render(scene_dict(field), seed=3), before)
 
 
+def test_the_package_may_be_reloaded(field: Path) -> None:
+    """As Mitsuba does from version 3.10 on, for packages that declare its entry point."""
+    mi.set_variant("llvm_ad_rgb")
+    importlib.reload(mi_nerf)
+    assert render(scene_dict(field)).shape == (12, 16, 4)
+
+
 def test_other_colour_modes_are_refused(field: Path) -> None:
     mi.set_variant("llvm_ad_spectral")
     with pytest.raises(RuntimeError, match="llvm_ad_spectral.*expected 'llvm_ad_rgb'"):
@@ -130,7 +138,7 @@ def test_scenes_without_one_field_in_a_cube(variant: str, field: Path) -> None:
 
 
 def test_alpha_is_the_opacity_and_aovs_follow(variant: str, field: Path) -> None:
-    image = render(scene_dict(field, integrator={"aovs": "depth, opacity"}))
+    image = render(scene_dict(field, integrator={"aovs": "z:depth, opacity"}))
     assert image.shape == (12, 16, 6)
     np.testing.assert_allclose(image[..., 3], image[..., 5], atol=1e-6)
     assert 0.05 < image[6, 8, 3] < 0.999  # neither a Boolean nor empty

@@ -13,6 +13,7 @@ import mitsuba as mi
 
 _MODULES = ("medium", "integrator")
 _loaded_for: str | None = None
+_follows_variant = False
 
 
 def register(*_: object) -> None:
@@ -31,6 +32,12 @@ def register(*_: object) -> None:
 
 
 def register_always() -> None:
-    """Registers now, and again after every change of variant."""
-    mi.detail.add_variant_callback(register)
+    """Registers now, and again after every change of variant.
+
+    May be called again: newer versions of Mitsuba reload the package on their own.
+    """
+    global _follows_variant
+    if not _follows_variant:
+        mi.detail.add_variant_callback(register)
+        _follows_variant = True
     register()

@@ -63,8 +63,8 @@ class NerfIntegrator(ADIntegrator):
      * - aovs
        - |string|
        - Extra channels, a comma-separated list of ``depth`` (mean distance along the
-         ray, weighted by contribution; 0 where the field is not seen) and ``opacity``.
-         (Default: none)
+         ray, weighted by contribution; 0 where the field is not seen) and ``opacity``,
+         each perhaps with a channel name in front as in ``z:depth``. (Default: none)
      * - hide_emitters
        - |bool|
        - Leave out the environment emitter behind the field. (Default: false)
@@ -103,15 +103,11 @@ class NerfIntegrator(ADIntegrator):
         self.jitter = bool(props.get("jitter", True))
         # Read by the base class in C++; kept here for the background.
         self.show_background = not bool(props.get("hide_emitters", False))
-        names = str(props.get("aovs", "")).replace(" ", "")
-        self.aovs = [n for n in names.split(",") if n]
-        for name in self.aovs:
-            if name not in _AOVS:
-                raise InputError(f"nerf: aov '{name}' is unknown, expected {' or '.join(_AOVS)}")
+        self.aovs = _parse_aovs(str(props.get("aovs", "")))
 
     def aov_names(self) -> list[str]:
         """Names of the extra channels."""
-        return list(self.aovs)
+        return [name for name, _ in self.aovs]
 
     def to_string(self) -> str:
         """Lists the settings."""
@@ -120,7 +116,7 @@ class NerfIntegrator(ADIntegrator):
             f"  samples = {self.samples or 'from field file'},\n"
             f"  near = {self.near}, far = {self.far},\n"
             f"  jitter = {self.jitter},\n"
-            f"  aovs = {self.aovs}\n"
+            f"  aovs = {self.aov_names()}\n"
             "]"
         )
 
@@ -214,7 +210,7 @@ class NerfIntegrator(ADIntegrator):
             wave = _Wave(ray, None, None, jitter, [])
             self._trace(scene, placed, wave)
         color, opacity, depth = wave.outputs[:3], wave.outputs[3], wave.outputs[4]
-        aovs = [{"depth": depth, "opacity": opacity}[n] for n in self.aovs]
+        aovs = self._aov_values(opacity, depth)
         return mi.Color3f(*color), opacity > 0, aovs, None
 
     # ---------------------------------- Camera rays ----------------------------------
@@ -241,7 +237,6 @@ class NerfIntegrator(ADIntegrator):
         for wave in waves:
             block = block or film.create_block()
             r, g, b, opacity, depth = wave.outputs
-            aovs = [{"depth": depth, "opacity": opacity}[n] for n in self.aovs]
             ADIntegrator._splat_to_block(
                 block,
                 film,
@@ -249,11 +244,16 @@ class NerfIntegrator(ADIntegrator):
                 value=mi.Color3f(r, g, b) * wave.weight,
                 weight=1.0,
                 alpha=opacity,
-                aovs=aovs,
+                aovs=self._aov_values(opacity, depth),
                 wavelengths=wave.ray.wavelengths,
             )
+            dr.eval(block.tensor())  # lets go of this pass before the next one
         film.put_block(block)
         return film.develop() if develop else None
+
+    def _aov_values(self, opacity: Any, depth: Any) -> list[Any]:
+        values = {"depth": depth, "opacity": opacity}
+        return [values[kind] for _, kind in self.aovs]
 
     # ---------------------------------- Field ----------------------------------
 
@@ -359,6 +359,18 @@ class NerfIntegrator(ADIntegrator):
         si.wi = -ray.d
         radiance = emitter.eval(si)
         return [radiance.x, radiance.y, radiance.z]
+
+
+def _parse_aovs(text: str) -> list[tuple[str, str]]:
+    """Channel names and kinds of a list such as ``depth, a:opacity``."""
+    aovs = []
+    for item in text.replace(" ", "").split(","):
+        name, _, kind = item.rpartition(":")
+        if item and kind not in _AOVS:
+            raise InputError(f"nerf: aov '{item}' is unknown, expected {' or '.join(_AOVS)}")
+        if item:
+            aovs.append((name or kind, kind))
+    return aovs
 
 
 def _linear(color: list[Any], opacity: Any) -> list[Any]:

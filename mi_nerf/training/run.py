@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 import platform
-import signal
 import time
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import numpy as np
-from tqdm.auto import tqdm
 
 from .. import __version__
 from ..backend import array_module
@@ -27,6 +22,7 @@ from ..files import check_folder, make_folder, read_json, write_json
 from ..volume import MarchSettings
 from .checkpoint import load_checkpoint, save_checkpoint
 from .config import TrainConfig, from_json, to_json
+from .progress import Meter, ProgressBar, interruptible
 from .schedule import learning_rate
 from .trainer import StepResult, Trainer
 
@@ -63,7 +59,7 @@ class Run:
         self._skipped = 0
         self._skipped_in_row = 0
         self._attempt_start = 0
-        self._since = _Meter()
+        self._since = Meter()
         # Squared errors of the last steps, as many as tell a collapse from bad luck.
         self._recent: deque[float] = deque(maxlen=max(1, min(100, config.collapse_check // 2)))
         self._pending: StepResult | None = None
@@ -102,11 +98,12 @@ class Run:
         Raises:
             TrainingError: after too many non-finite steps in a row, or collapses.
         """
-        bar = _ProgressBar(self.config, self.progress, show_bar)
+        bar = ProgressBar(self.config, self.progress, show_bar)
         last_report = last_save = self.seconds
-        with (self.folder / LOG).open("a") as log, _interruptible() as stop, bar:
+        with (self.folder / LOG).open("a") as log, interruptible() as stop, bar:
             self._log = log
-            while self.progress < 1 and not stop:
+            # At least one step, so that there is always a field to look at.
+            while (self.progress < 1 or self.trainer.step_count == 0) and not stop:
                 self._advance()
                 if self._collapsed():
                     self._restart()
@@ -196,7 +193,7 @@ class Run:
         self._attempt_start = self.trainer.step_count
         self._write({"event": "restart", "attempt": self.trainer.attempt, "reason": "collapse"})
         self.trainer.reset()
-        self._since = _Meter()
+        self._since = Meter()
         self._recent.clear()
 
     # ---------------------------------- Reports ----------------------------------
@@ -210,7 +207,7 @@ class Run:
             "occupied": 1.0 if occupancy is None else occupancy.fraction(),
             "skipped": self._skipped,
         }
-        self._since = _Meter()
+        self._since = Meter()
         return self._write(line)
 
     def _write(self, line: dict[str, Any]) -> dict[str, Any]:
@@ -218,70 +215,6 @@ class Run:
         self._log.write(json.dumps(line) + "\n")
         self._log.flush()
         return line
-
-
-class _Meter:
-    """Means over the steps since the last report."""
-
-    def __init__(self) -> None:
-        self._losses: list[float] = []
-        self._errors: list[float] = []
-        self._rays = self._queries = 0
-        self._start = time.monotonic()
-
-    def add(self, loss: float, mse: float, result: StepResult) -> None:
-        self._losses.append(loss)
-        self._errors.append(mse)
-        self._rays += result.rays
-        self._queries += result.queries
-
-    def summary(self) -> dict[str, Any]:
-        elapsed = max(time.monotonic() - self._start, 1e-9)
-        mse = float(np.mean(self._errors)) if self._errors else math.nan
-        return {
-            "loss": float(np.mean(self._losses)) if self._losses else None,
-            "psnr": -10 * math.log10(mse) if mse > 0 else None,
-            "samples_per_ray": self._queries / max(self._rays, 1),
-            "rays": self._rays,
-            "samples_per_second": self._queries / elapsed,
-        }
-
-
-class _ProgressBar:
-    """A bar on a terminal, a quiet line now and then elsewhere."""
-
-    def __init__(self, config: TrainConfig, initial: float, show: bool) -> None:
-        by_time = config.max_seconds is not None
-        self._scale = float(config.max_seconds or config.steps or 1)
-        terminal = show and _is_terminal()
-        self._bar = tqdm(
-            total=round(self._scale, 1),
-            initial=round(initial * self._scale, 1),
-            unit="s" if by_time else "step",
-            desc="train",
-            disable=not terminal,
-            bar_format="{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} {postfix}",
-        )
-        self._lines = show and not terminal
-        self._last_line = -math.inf
-
-    def __enter__(self) -> _ProgressBar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def update(self, progress: float, line: dict[str, Any], final: bool) -> None:
-        loss, psnr = line["loss"], line["psnr"]
-        text = (
-            f"loss {loss:.5f}, psnr {psnr:.2f} dB, " if loss is not None and psnr else ""
-        ) + f"{line['samples_per_second'] / 1e3:.0f}k samples/s"
-        self._bar.set_postfix_str(text, refresh=False)
-        self._bar.n = progress * self._scale
-        self._bar.refresh()
-        if self._lines and (line["seconds"] - self._last_line >= 10 or progress >= 1 or final):
-            print(f"step {line['step']}, {line['seconds']:.0f} s: {text}", flush=True)
-            self._last_line = line["seconds"]
 
 
 def start(
@@ -388,32 +321,3 @@ def _cut_log(path: Path, step: int) -> None:
         except (ValueError, KeyError):  # a line cut short when the run was killed
             continue
     path.write_text("".join(line + "\n" for line in kept))
-
-
-@contextmanager
-def _interruptible() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM instead of raising; a second one acts as usual."""
-    received: list[int] = []
-    previous: dict[int, Any] = {}
-
-    def handler(number: int, _frame: Any) -> None:
-        received.append(number)
-        signal.signal(number, previous[number])
-
-    try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            previous[number] = signal.getsignal(number)
-            signal.signal(number, handler)
-    except ValueError:  # not the main thread: signals go where they always go
-        previous.clear()
-    try:
-        yield received
-    finally:
-        for restored, action in previous.items():
-            signal.signal(restored, action)
-
-
-def _is_terminal() -> bool:
-    import sys
-
-    return sys.stderr.isatty()

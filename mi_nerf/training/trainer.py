@@ -187,8 +187,10 @@ class Trainer:
 
     def _keep(self, samples: Samples) -> bool:
         """Whether the activations of this batch fit in the memory set aside for them."""
-        network = self.config.network
-        units = 2 * (network.depth + 1) * network.width + network.view_width
+        config, network = self.field_config, self.config.network
+        units = config.position.size + config.direction.size + network.depth * network.width
+        units += int(network.feature_layer) * network.width
+        units += network.view_depth * network.view_width
         return samples.queries * units * 4 < self.config.store_activations * 2**30
 
     def _refresh_occupancy(self) -> None:
