@@ -4,7 +4,7 @@
 
 Prints resident megabytes every 200 of 2000 steps of the preset ``nerf``, the number of
 kernels compiled in the last 1000 of them, and the peak while Mitsuba renders 800x800
-pixels of the published 8x256 network with 64 samples a ray.
+pixels of the published 8x256 network with 16 samples a ray.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--size", type=int, default=800)
-    parser.add_argument("--samples", type=int, default=64)
+    parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--variant")
     options = parser.parse_args()
     variant = choose_variant(options.variant)
