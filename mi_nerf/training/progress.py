@@ -57,7 +57,7 @@ class ProgressBar:
             unit="s" if by_time else "step",
             desc="train",
             disable=not terminal,
-            bar_format="{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit} {postfix}",
+            bar_format="{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit}{postfix}",
         )
         self._lines = show and not terminal
         self._last_line = -math.inf
