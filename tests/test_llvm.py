@@ -174,7 +174,7 @@ def test_carried_folders_of_each_kind_of_installation(monkeypatch):
     monkeypatch.setattr(sys, "prefix", "/venv")
     assert set(folders("/venv/lib/python3.12/site-packages")) == {"/venv/lib"}
     assert "/home/me/.local/lib" in folders("/home/me/.local/lib/python3.12/site-packages")
-    assert folders("/home/me/work/checkout") == ["/venv/lib"]  # nothing around it
+    assert folders("/home/me/src/checkout") == ["/venv/lib"]  # nothing around it
 
 
 # ---- The startup file -------------------------------------------------------------------------
