@@ -46,8 +46,3 @@ def gather_vector3(source: Any, index: Any) -> Any:
     """Gathers the three components of ``source`` at ``index``, as an ``Array3``."""
     float_type = type(source[0])
     return vector3_type(float_type)(*(dr.gather(float_type, source[i], index) for i in range(3)))
-
-
-def uint64_type(float_type: type) -> Any:
-    """The 64-bit index array beside ``float_type``."""
-    return dr.uint64_array_t(float_type)

@@ -245,7 +245,7 @@ def _write_video(target: Path, frames: Frames, fps: int) -> None:
 
 
 def _cameras(target: Target, path: Path_) -> Dataset:
-    """The views whose cameras a path follows; one image is read for its size."""
+    """The views whose cameras a path follows."""
     assert target.data is not None
     if path != "test":
         return load_dataset(target.data, "train", downscale=target.downscale)

@@ -60,9 +60,10 @@ def render_view(
         planes = np.stack([np.array(v) for v in (*seen.color, seen.opacity, seen.depth)])
         total.append(planes)
         queries += seen.queries
-    planes = np.mean(total, axis=0).reshape(5, intrinsics.height, intrinsics.width)
+    shape = (intrinsics.height, intrinsics.width)
+    planes = np.mean([t[:4] for t in total], axis=0).reshape(4, *shape)
     color = np.moveaxis(planes[:3], 0, -1)
-    return View(color, planes[3], _mean_depth(total).reshape(planes[3].shape), queries)
+    return View(color, planes[3], _mean_depth(total).reshape(shape), queries)
 
 
 def display_image(view: View, color_space: str, background: float = 1.0) -> Image:

@@ -17,6 +17,7 @@ from typing import Any
 
 import drjit as dr
 
+from .arrays import gather_vector3
 from .field import Field
 from .occupancy import OccupancyGrid
 from .quadrature import Composite, composite
@@ -193,8 +194,7 @@ class Evaluation:
         ray = where // samples.count
         t = dr.gather(type(samples.t), samples.t, where)
         p = points_along(samples.o, samples.d, t, ray)
-        d = type(p)(*(dr.gather(type(t), samples.d[i], ray) for i in range(3)))
-        density, emission = self._field.density_emission(p, d)
+        density, emission = self._field.density_emission(p, gather_vector3(samples.d, ray))
         return [density, *emission]
 
 
@@ -262,12 +262,7 @@ def slice_rays(o: Any, d: Any, jitter: Any, start: int, size: int) -> tuple[Any,
     float_type = type(o[0])
     uint = dr.uint32_array_t(float_type)
     index = dr.arange(uint, size) + dr.opaque(uint, start)
-
-    def take(v: Any) -> Any:
-        return dr.gather(float_type, v, index)
-
-    part_o = type(o)(*(take(o[i]) for i in range(3)))
-    part_d = type(d)(*(take(d[i]) for i in range(3)))
-    offset = None if jitter is None else take(jitter)
+    part_o, part_d = gather_vector3(o, index), gather_vector3(d, index)
+    offset = None if jitter is None else dr.gather(float_type, jitter, index)
     dr.eval(index, part_o, part_d, offset)
     return index, part_o, part_d, offset

@@ -63,9 +63,9 @@ class NerfMedium(mi.Medium):
         name = str(props["filename"])
         self._path = str(mi.file_resolver().resolve(name))
         self._use_occupancy = bool(props.get("occupancy", True))
-        self._file = load_field(self._path)
-        self.field, self._grid = self._file.build(mi)
-        self.march = self._file.march
+        contents = load_field(self._path)
+        self.field, self._grid = contents.build(mi)
+        self.march = contents.march
         # Parameter names must not hold dots, which separate objects.
         self._names = {n.replace(".", "_"): n for n in self.field.parameters()}
 

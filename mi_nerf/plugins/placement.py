@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import drjit as dr
@@ -56,14 +57,19 @@ def cube_to_world(shape: mi.Shape) -> np.ndarray[Any, Any]:
         raise InputError(
             f"nerfmedium: inside a shape of type '{shape.class_name()}', expected a 'cube'"
         )
-    source, target = _corners(mi.load_dict({"type": "cube"})), _corners(shape)
-    solution, *_ = np.linalg.lstsq(source, target[:, :3], rcond=None)
+    solution, *_ = np.linalg.lstsq(_unit_corners(), _corners(shape)[:, :3], rcond=None)
     to_world = np.eye(4)
     to_world[:3] = solution.T
     stretch = np.linalg.svd(to_world[:3, :3], compute_uv=False)
     if not stretch[-1] > 1e-6 * stretch[0]:  # also catches NaN
         raise InputError("nerfmedium: the cube's to_world is singular, expected a volume")
     return to_world
+
+
+@lru_cache(maxsize=1)
+def _unit_corners() -> np.ndarray[Any, Any]:
+    """The corners of a cube that was not moved, in the order of Mitsuba's vertices."""
+    return _corners(mi.load_dict({"type": "cube"}))
 
 
 def _corners(shape: mi.Shape) -> np.ndarray[Any, Any]:

@@ -8,7 +8,6 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..arrays import uint64_type
 from ..cameras import pack_poses, pixel_rays
 from ..data import Dataset
 
@@ -77,4 +76,4 @@ def blank_loss(dataset: Dataset, background: str) -> float:
 
 def step_rng(float_type: Any, seed: int, step: int) -> Any:
     """The generator of one training step: all its randomness follows from seed and step."""
-    return dr.rng(seed=dr.opaque(uint64_type(float_type), (seed << 32) + step))
+    return dr.rng(seed=dr.opaque(dr.uint64_array_t(float_type), (seed << 32) + step))
