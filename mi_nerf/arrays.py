@@ -20,20 +20,31 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+_CACHE_LINE = 64  # bytes
+
 
 def upload(array_type: Any, values: Any) -> Any:
     """Copies a NumPy array into memory of Dr.Jit's own.
 
-    On the CPU Dr.Jit otherwise borrows NumPy's memory, and compiles another kernel where
-    that happens not to be aligned.
+    On the CPU Dr.Jit otherwise borrows NumPy's memory, and compiles another kernel, be it
+    for a copy, where that happens not to be aligned.
     """
-    result = array_type(np.ascontiguousarray(values))
+    result = array_type(_aligned(np.asarray(values)))
     flat = result.array if dr.is_tensor_v(array_type) else result
     if len(flat) == 0:
         return result
     copy = flat + dr.opaque(type(flat), 0)
     dr.eval(copy)
     return array_type(copy, shape=result.shape) if dr.is_tensor_v(array_type) else copy
+
+
+def _aligned(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """A contiguous copy whose memory starts at a multiple of a cache line."""
+    memory = np.empty(values.nbytes + _CACHE_LINE, np.uint8)
+    start = -memory.ctypes.data % _CACHE_LINE
+    copy = memory[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
+    copy[...] = values
+    return copy
 
 
 def vector3_type(float_type: type) -> Any:

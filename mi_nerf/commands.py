@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union
 
@@ -18,7 +18,10 @@ from .demo import run_demo
 from .errors import InputError
 from .evaluation import evaluate, quality
 from .files import check_file, check_folder, make_folder, write_json
+from .generation import Options, generate
+from .generation.run import summary
 from .rendering import check_output, output_kind, run_frames, scene_frames, write_frames
+from .scene_library import find_scene
 from .target import open_target
 from .training import run as training
 from .training.config import with_settings
@@ -27,6 +30,74 @@ from .training.presets import preset
 Variant = Annotated[
     str | None, arg(help="Mitsuba variant; default: CUDA where it works, LLVM otherwise.")
 ]
+
+
+@dataclass(frozen=True)
+class Generate:
+    """Path-traces a dataset from a Mitsuba scene, with depth, normals and known noise.
+
+    Examples:
+
+    mi-nerf generate bonsai data/bonsai
+
+    mi-nerf generate bonsai data/small --train 40 --test 10 --size 200 200 --spp 64
+
+    mi-nerf generate my_scene.xml data/mine --up y --cameras sphere --seed 1
+
+    mi-nerf generate bonsai data/bonsai --resume
+    """
+
+    scene: Positional[Annotated[str, arg(metavar="SCENE")]]
+    """A Mitsuba XML file, or the name of a scene that comes with mi_nerf."""
+    out: Positional[Annotated[Path, arg(metavar="OUT")]]
+    """Folder of the dataset: new or empty, or with --resume one that was begun."""
+    protocol: Literal["realistic360", "diffuse360", "forward"] | None = None
+    """Numbers of views, size and cameras of the paper's datasets; default: the scene's own,
+    or realistic360."""
+    train: int | None = None
+    """Training views; default: the protocol's (100, 479, 28)."""
+    val: int | None = None
+    """Validation views (10, 10, 0)."""
+    test: int | None = None
+    """Test views (200, 1000, and for forward every eighth of all)."""
+    size: tuple[int, int] | None = None
+    """Width and height (800 800, 512 512, 1008 756)."""
+    spp: int | None = None
+    """Samples a pixel; default: those of the scene's sampler."""
+    seed: int = 0
+    """Seed of camera positions and of the noise."""
+    resume: bool = False
+    """Go on with the dataset in OUT; missing and damaged views are made again."""
+    cameras: Literal["hemisphere", "sphere"] | None = None
+    """Where the cameras of the 360-degree protocols stand; default: as the scene says, or on
+    the hemisphere."""
+    up: Literal["x", "y", "z"] | None = None
+    """Vertical axis; default: that of the scene's sensor, or z."""
+    center: tuple[float, float, float] | None = None
+    """What the cameras look at; default: the origin for scenes in [-1, 1]^3, the middle of the
+    scene's box for others."""
+    radius: float | None = None
+    """Their distance from it; default: 4 for scenes in [-1, 1]^3, in proportion for others."""
+    set: UseAppendAction[tuple[str, ...]] = ()
+    """Values of the scene's $parameters: name=value; repeatable."""
+    variant: Variant = None
+
+    def run(self, _started: float) -> None:
+        """Generates."""
+        names = [field.name for field in fields(Options)]
+        options = Options(**{name: getattr(self, name) for name in names})
+        _seed(self.seed)
+        record = generate(
+            find_scene(self.scene),
+            self.out,
+            choose_variant(self.variant),
+            options,
+            parameters=dict(_pair(text) for text in self.set),
+            resume=self.resume,
+        )
+        print(f"{self.out}: {summary(record)}")
+        if not record["complete"]:
+            raise KeyboardInterrupt
 
 
 @dataclass(frozen=True)
@@ -291,7 +362,14 @@ class Demo:
         )
 
 
-COMMANDS = {"demo": Demo, "train": Train, "eval": Eval, "render": Render, "info": Info}
+COMMANDS = {
+    "demo": Demo,
+    "generate": Generate,
+    "train": Train,
+    "eval": Eval,
+    "render": Render,
+    "info": Info,
+}
 
 
 def command_type(chosen: str | None) -> Any:
@@ -308,6 +386,13 @@ def _positive(name: str, value: Any) -> Any:
     if not 0 < value < math.inf:
         raise InputError(f"--{name} {value}: expected a number above 0")
     return value
+
+
+def _pair(text: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not (name and equals):
+        raise InputError(f"--set {text}: expected name=value")
+    return name, value
 
 
 def _seed(value: int) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import sys
 import tempfile
 import time
 from dataclasses import replace
@@ -12,14 +10,12 @@ from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
-from tqdm.auto import tqdm
 
-from .cameras import Intrinsics, look_at, sensor_dict
 from .data import load_dataset
 from .errors import InputError
 from .evaluation import evaluate, quality, reference_image
 from .files import make_folder, replacing, write_json
-from .rendering import load_scene, write_picture
+from .generation import Options, generate
 from .scene_library import find_scene
 from .target import open_target
 from .training import run as training
@@ -28,8 +24,6 @@ from .training.presets import preset
 Image = np.ndarray[Any, Any]
 
 SCENE = "spheres"
-CAMERA_ANGLE_X = 0.6911  # of nerf_synthetic
-RADIUS = 4.0
 
 
 def run_demo(
@@ -38,7 +32,8 @@ def run_demo(
     *,
     seconds: float = 45.0,
     seed: int = 0,
-    views: dict[str, int] | None = None,
+    train: int = 40,
+    test: int = 8,
     size: int = 128,
     spp: int = 128,
 ) -> dict[str, Any]:
@@ -54,10 +49,12 @@ def run_demo(
         InputError: if ``out`` is given and not empty.
     """
     folder = _fresh_folder(out)
-    views = views or {"train": 40, "test": 8}
     clock = time.monotonic()
-    print(f"1/4  path-tracing {sum(views.values())} views of scenes/{SCENE}.xml")
-    _trace_dataset(folder / "data", variant, views, size, spp, seed)
+    print(f"1/4  path-tracing {train + test} views of the scene '{SCENE}'")
+    options = Options(train=train, val=0, test=test, size=(size, size), spp=spp, seed=seed)
+    traced = generate(find_scene(SCENE), folder / "data", variant, options)
+    if not traced["complete"]:
+        raise KeyboardInterrupt
     print(f"2/4  training for {seconds:.0f} s")
     config = replace(preset("nerf"), seed=seed, max_seconds=seconds)
     run = training.start(folder / "data", folder / "run", config, variant)
@@ -88,44 +85,6 @@ def _fresh_folder(out: Path | None) -> Path:
     while (folder := Path("mi-nerf-demo" + (f"-{number}" if number > 1 else ""))).exists():
         number += 1
     return make_folder(folder)
-
-
-def _trace_dataset(
-    folder: Path, variant: str, views: dict[str, int], size: int, spp: int, seed: int
-) -> None:
-    import mitsuba as mi
-
-    mi.set_variant(variant)
-    scene = load_scene(find_scene(SCENE))
-    camera = Intrinsics.from_angle_x(size, size, CAMERA_ANGLE_X)
-    bar = tqdm(total=sum(views.values()), unit="view", disable=not sys.stderr.isatty())
-    first = 0
-    with bar:
-        for split, count in views.items():
-            make_folder(folder / split)
-            frames = []
-            for i, pose in enumerate(_hemisphere(count, seed + first)):
-                sensor = mi.load_dict(sensor_dict(camera, pose, spp=spp))
-                image = np.array(mi.render(scene, sensor=sensor, spp=spp, seed=seed + first + i))
-                write_picture(folder / split / f"r_{i}.png", image)
-                frames.append({"file_path": f"./{split}/r_{i}", "transform_matrix": pose.tolist()})
-                bar.update()
-            record = {"camera_angle_x": CAMERA_ANGLE_X, "frames": frames}
-            write_json(folder / f"transforms_{split}.json", record)
-            first += count
-
-
-def _hemisphere(count: int, seed: int) -> list[Image]:
-    """Cameras evenly spread over the upper hemisphere (Fibonacci lattice), looking inwards."""
-    turn = np.random.default_rng(seed).random() * 2 * math.pi
-    poses = []
-    for i in range(count):
-        height = 0.08 + 0.87 * (i + 0.5) / count
-        angle = turn + i * math.pi * (3 - math.sqrt(5))
-        level = math.sqrt(1 - height * height)
-        origin = RADIUS * np.array([level * math.cos(angle), level * math.sin(angle), height])
-        poses.append(look_at(origin, (0, 0, 0)))
-    return poses
 
 
 def _draw_comparison(folder: Path, pictures: Path) -> None:

@@ -14,6 +14,8 @@ from .backend import available_variants
 from .data import available_splits, load_dataset
 from .errors import InputError
 from .field_file import FieldFile, load_field
+from .files import read_json
+from .generation.run import RECORD
 from .tensor_file import read_metadata, read_tensors
 from .training import checkpoint
 from .training.run import CHECKPOINT, CONFIG, FIELD, read_config
@@ -120,6 +122,7 @@ def _dataset(folder: Path) -> str:
             f"{folder}: expected a run with its {CONFIG}, or a dataset with "
             "transforms_{train,val,test}.json"
         ) from None
+    rows |= _provenance(folder)
     for split in splits:
         dataset = load_dataset(folder, split)
         size = dataset.intrinsics
@@ -129,6 +132,28 @@ def _dataset(folder: Path) -> str:
             f"field of view {size.fov_x:.1f} degrees"
         )
     return _table(rows)
+
+
+def _provenance(folder: Path) -> dict[str, str]:
+    """What ``mi-nerf generate`` recorded, if it made this dataset."""
+    if not (folder / RECORD).exists():
+        return {}
+    record = read_json(folder / RECORD, "the record of a dataset")
+    try:
+        settings, noise = record["settings"], record["noise"]
+        return {
+            "scene": f"{record['scene']['file']}, SHA-256 {record['scene']['sha256'][:16]}...",
+            "path-traced": f"{settings['spp']} samples a pixel, seed {settings['seed']}, "
+            f"{record['variant']}, Mitsuba {record['versions']['mitsuba']}",
+            "PSNR ceiling": ", ".join(
+                f"{split} {figures['psnr_ceiling']:.2f} dB"
+                for split, figures in noise.items()
+                if figures["psnr_ceiling"] is not None
+            )
+            or "free of noise",
+        }
+    except (KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{folder / RECORD}: damaged record of a dataset: {error!r}") from error
 
 
 def _corner(v: tuple[float, float, float]) -> str:

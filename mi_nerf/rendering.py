@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 import imageio.v2 as imageio
-import imageio.v3 as iio
 import numpy as np
 
 from .backend import array_module
 from .cameras import Intrinsics
-from .color import linear_to_srgb, srgb_to_linear
+from .color import srgb_to_linear
 from .data import Dataset, available_splits, load_dataset
 from .errors import InputError
 from .files import check_file, check_folder, make_folder, replacing
-from .images import write_exr
+from .images import encoded, write_picture
+from .scene_file import load_scene
 from .target import Target
 from .trajectory import orbit_like, spiral_like
 from .views import render_view
@@ -125,35 +124,6 @@ def scene_frames(
     return frames, _moving(scene, sensors[0], path, frames, render)
 
 
-def load_scene(path: str | Path) -> Any:
-    """Loads Mitsuba XML; what Mitsuba says goes into one line.
-
-    Raises:
-        InputError: if the file is missing or Mitsuba refuses it.
-    """
-    import mitsuba as mi
-
-    if not Path(path).is_file():
-        raise InputError(f"{path}: not found, expected a run folder or a Mitsuba XML scene")
-    try:
-        scene = mi.load_file(str(path))
-    except Exception as error:  # Mitsuba raises RuntimeError for all that can be wrong
-        message = _without_traceback(str(error))
-        raise InputError(f"{path}: Mitsuba cannot load this scene: {message}") from error
-    if not isinstance(scene, mi.Scene):
-        raise InputError(f"{path}: expected <scene> as the outermost element")
-    return scene
-
-
-def _without_traceback(message: str) -> str:
-    """One line: of a Python plugin's traceback in it, only what the exception says."""
-    before, found, traceback = message.partition("Traceback (most recent call last):")
-    if found:
-        said = re.findall(r"^[\w.]*(?:Error|Exception): (.*)", traceback, re.MULTILINE)
-        message = before + (said[-1] if said else traceback)
-    return " ".join(message.split())
-
-
 def write_frames(
     out: str | Path,
     count: int,
@@ -216,19 +186,6 @@ def check_output(target: Path, count: int) -> None:
         check_file(target)
 
 
-def write_picture(path: Path, image: Image) -> None:
-    """Writes (H, W, 4) linear premultiplied RGBA as ``.exr`` or ``.png``."""
-    with replacing(path) as temporary:
-        if path.suffix.lower() == ".exr":
-            write_exr(temporary, image)
-        else:
-            alpha = np.clip(image[..., 3:], 0, 1)
-            straight = image[..., :3] / np.where(alpha > 0, alpha, 1)
-            straight = np.where(alpha > 0, linear_to_srgb(straight), 0)
-            pixels = np.concatenate([np.clip(straight, 0, 1), alpha], axis=-1)
-            iio.imwrite(temporary, np.rint(pixels * 255).astype(np.uint8), extension=".png")
-
-
 def _write_video(target: Path, frames: Frames, fps: int) -> None:
     with replacing(target) as temporary:
         writer = imageio.get_writer(
@@ -239,9 +196,9 @@ def _write_video(target: Path, frames: Frames, fps: int) -> None:
                 # Players want even sizes: an odd one grows by a copy of its last row or column.
                 height, width = image.shape[:2]
                 image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-                straight = image[..., :3] / np.maximum(image[..., 3:], 1e-6)
-                encoded = linear_to_srgb(straight) * image[..., 3:] + 1 - image[..., 3:]
-                writer.append_data(np.rint(np.clip(encoded, 0, 1) * 255).astype(np.uint8))
+                straight = encoded(image)
+                on_white = straight[..., :3] * straight[..., 3:] + 1 - straight[..., 3:]
+                writer.append_data(np.rint(on_white * 255).astype(np.uint8))
 
 
 def _cameras(target: Target, path: Path_) -> Dataset:

@@ -27,7 +27,13 @@ def find_scene(name: str) -> Path:
         if Path(name).is_file():
             return Path(name)
         raise InputError(f"{name}: not found, expected a Mitsuba XML scene")
-    scenes = {p.stem: p for p in sorted(scene_folder().rglob("*.xml"))}
-    if name not in scenes:
-        raise InputError(f"scene '{name}': unknown, expected an .xml file or {', '.join(scenes)}")
-    return scenes[name]
+    known = scenes()
+    if name not in known:
+        raise InputError(f"scene '{name}': unknown, expected an .xml file or {', '.join(known)}")
+    return known[name]
+
+
+def scenes() -> dict[str, Path]:
+    """The scenes that come with mi_nerf, by name. ``assets`` holds parts of them only."""
+    files = (p for p in scene_folder().rglob("*.xml") if p.parent.name != "assets")
+    return {path.stem: path for path in sorted(files)}

@@ -28,7 +28,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     folder = tmp_path_factory.mktemp("demo")  # empty folders are welcome
     text = io.StringIO()
     with contextlib.redirect_stdout(text):
-        record = run_demo(folder, choose_variant(), seconds=3, views=VIEWS, size=20, spp=4)
+        record = run_demo(folder, choose_variant(), seconds=3, **VIEWS, size=20, spp=4)
     return folder, record, text.getvalue()
 
 

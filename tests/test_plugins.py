@@ -105,7 +105,7 @@ def test_bad_integrator_properties(variant: str, integrator: Any, message: str) 
 def test_missing_field_file(variant: str, tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match=r"nothing\.safetensors: not found"):
         mi.load_dict({"type": "nerfmedium", "filename": str(tmp_path / "nothing.safetensors")})
-    with pytest.raises(RuntimeError, match="'filename' is missing"):
+    with pytest.raises(RuntimeError, match="expected 'filename', a field file, or 'field'"):
         mi.load_dict({"type": "nerfmedium"})
 
 

@@ -6,8 +6,10 @@ from typing import Any
 
 import mitsuba as mi
 
+from ..closed_form import closed_form
 from ..errors import InputError
 from ..field_file import load_field
+from ..volume import MarchSettings
 
 
 class NerfMedium(mi.Medium):
@@ -23,12 +25,18 @@ class NerfMedium(mi.Medium):
        - |string|
        - Field file (``field.safetensors``) written by ``mi-nerf train`` or
          ``mi-nerf import``; looked up like any file of the scene.
+     * - field
+       - |string|
+       - Instead of ``filename``: a field given by a formula. :monosp:`gaussian` has
+         ``center``, ``width`` (standard deviation), ``peak`` (density at the centre, in
+         1/scene unit), ``radiance`` (a vector: linear RGB) and ``extent`` (half the side of
+         its box, in widths).
      * - occupancy
        - |bool|
        - Skip the cells that the field file marks as empty. (Default: true)
      * - (weights)
        - |tensor|
-       - All tensors of the network, e.g. ``trunk_0_weight``.
+       - All tensors of the network, e.g. ``trunk_0_weight``, or the formula's parameters.
        - |exposed|, |differentiable|
 
     The medium belongs inside a ``cube``. The cube's ``to_world`` carries the field's own
@@ -58,16 +66,37 @@ class NerfMedium(mi.Medium):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        if "filename" not in props:
-            raise InputError("nerfmedium: 'filename' is missing, expected a field file")
-        name = str(props["filename"])
-        self._path = str(mi.file_resolver().resolve(name))
         self._use_occupancy = bool(props.get("occupancy", True))
-        contents = load_field(self._path)
-        self.field, self._grid = contents.build(mi)
-        self.march = contents.march
+        self._grid: Any = None
+        self.field: Any
+        if "field" in props:
+            self._describe_formula(props)
+        elif "filename" in props:
+            self._load_file(str(mi.file_resolver().resolve(str(props["filename"]))))
+        else:
+            raise InputError("nerfmedium: expected 'filename', a field file, or 'field', a formula")
         # Parameter names must not hold dots, which separate objects.
         self._names = {n.replace(".", "_"): n for n in self.field.parameters()}
+
+    def _load_file(self, path: str) -> None:
+        contents = load_field(path)
+        self._source = path
+        self.field, self._grid = contents.build(mi)
+        self.march = contents.march
+
+    def _describe_formula(self, props: mi.Properties) -> None:
+        if "filename" in props:
+            raise InputError("nerfmedium: both 'filename' and 'field', expected one of them")
+        self._source = str(props["field"])
+        values = {}
+        for name in (n for n in props.unqueried() if n != "to_world"):
+            value = props[name]
+            values[name] = value if isinstance(value, float) else tuple(map(float, value))
+        try:
+            self.field = closed_form(self._source, values, mi.TensorXf)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"nerfmedium: {error}") from error
+        self.march = MarchSettings(samples=128)
 
     @property
     def occupancy(self) -> Any:
@@ -87,13 +116,12 @@ class NerfMedium(mi.Medium):
 
     def to_string(self) -> str:
         """Lists the settings."""
-        config = self.field.config
         return (
             "NerfMedium[\n"
-            f"  filename = {self._path},\n"
-            f"  lower = {config.lower}, upper = {config.upper},\n"
-            f"  color_space = {config.color_space},\n"
-            f"  parameters = {config.parameter_count()},\n"
+            f"  source = {self._source},\n"
+            f"  lower = {self.field.lower}, upper = {self.field.upper},\n"
+            f"  color_space = {self.field.color_space},\n"
+            f"  parameters = {list(self._names)},\n"
             f"  occupancy = {self.occupancy is not None}\n"
             "]"
         )

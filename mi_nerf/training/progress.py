@@ -1,13 +1,10 @@
-"""What the user sees and does while a run goes on: figures, a bar, Ctrl-C."""
+"""What the user sees while a run goes on: figures and a bar."""
 
 from __future__ import annotations
 
 import math
-import signal
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -79,26 +76,3 @@ class ProgressBar:
         if self._lines and (line["seconds"] - self._last_line >= 10 or progress >= 1 or final):
             print(f"step {line['step']}, {line['seconds']:.0f} s: {text}", flush=True)
             self._last_line = line["seconds"]
-
-
-@contextmanager
-def interruptible() -> Iterator[list[int]]:
-    """Collects SIGINT and SIGTERM instead of raising; a second one acts as usual."""
-    received: list[int] = []
-    previous: dict[int, Any] = {}
-
-    def handler(number: int, _frame: Any) -> None:
-        received.append(number)
-        signal.signal(number, previous[number])
-
-    try:
-        for number in (signal.SIGINT, signal.SIGTERM):
-            previous[number] = signal.getsignal(number)
-            signal.signal(number, handler)
-    except ValueError:  # not the main thread: signals go where they always go
-        previous.clear()
-    try:
-        yield received
-    finally:
-        for restored, action in previous.items():
-            signal.signal(restored, action)

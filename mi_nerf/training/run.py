@@ -19,10 +19,11 @@ from ..data import Dataset, load_dataset
 from ..errors import InputError
 from ..field_file import FieldFile, save_field
 from ..files import check_folder, make_folder, read_json, write_json
+from ..interrupts import interruptible
 from ..volume import MarchSettings
 from .checkpoint import load_checkpoint, save_checkpoint
 from .config import TrainConfig, from_json, to_json
-from .progress import Meter, ProgressBar, interruptible
+from .progress import Meter, ProgressBar
 from .schedule import learning_rate
 from .trainer import StepResult, Trainer
 

@@ -1,0 +1,7 @@
+"""Path-traced datasets from Mitsuba scenes: ``mi-nerf generate``."""
+
+from .plan import Plan, make_plan
+from .protocol import PROTOCOLS, Options, Protocol
+from .run import generate
+
+__all__ = ["PROTOCOLS", "Options", "Plan", "Protocol", "generate", "make_plan"]

@@ -1,0 +1,86 @@
+"""How far a path-traced image is from the one that it converges to.
+
+An image of n samples a pixel is rendered as two independent ones A and B of n₁ + n₂ = n
+samples, and their weighted mean M is kept. A pixel's variance being σ²/samples,
+E[(A − B)²] = σ²(1/n₁ + 1/n₂), and the variance of M, which is its mean squared error
+because path tracing is unbiased, is σ²/n. So
+
+    D = (A − B)·√(n₁n₂)/n
+
+has mean zero and the variance of M's error: mean(D²) is an unbiased estimate of its mean
+squared error against the converged image.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ..images import encoded
+
+Image = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Estimated mean squared errors of one view against its converged image."""
+
+    mse_linear: float  # of linear premultiplied RGB, unbiased
+    mse_srgb: float  # of sRGB on white in [0, 1]; unbiased to first order in the noise
+    mse_8bit: float  # the same after both images are rounded to 8 bits, as nerf2020 measures
+
+    @property
+    def psnr_ceiling(self) -> float | None:
+        """The PSNR in dB that the converged image itself would get; ``None``: infinite."""
+        return -10 * math.log10(self.mse_8bit) if self.mse_8bit > 0 else None
+
+    def record(self) -> dict[str, float | None]:
+        """What ``dataset.json`` holds."""
+        return {**asdict(self), "psnr_ceiling": self.psnr_ceiling}
+
+
+def estimate(a: Image, b: Image, samples: tuple[int, int]) -> Noise:
+    """The noise of the weighted mean of two renderings.
+
+    Args:
+        a, b: Linear premultiplied RGBA of the same view, (H, W, 4), independent.
+        samples: Samples a pixel of each.
+    """
+    scale = math.sqrt(samples[0] * samples[1]) / sum(samples)
+    linear = (a[..., :3] - b[..., :3]) * scale
+    display = (on_white(a) - on_white(b)) * scale
+    return Noise(
+        mse_linear=_mean_square(linear),
+        mse_srgb=_mean_square(display),
+        mse_8bit=_rounded_mean_square(display),
+    )
+
+
+def mean_image(a: Image, b: Image, samples: tuple[int, int]) -> Image:
+    """The mean of two renderings, weighted by their samples a pixel."""
+    share = samples[0] / sum(samples)
+    return (a * share + b * (1 - share)).astype(np.float32)
+
+
+def on_white(image: Image) -> Image:
+    straight = encoded(image)
+    return straight[..., :3] * straight[..., 3:] + (1 - straight[..., 3:])
+
+
+def _mean_square(values: Image) -> float:
+    return float(np.mean(np.square(values), dtype=np.float64))
+
+
+def _rounded_mean_square(errors: Image) -> float:
+    """E[(round(u + e) − round(u))²] over u uniform within a step of 1/255.
+
+    With |e| = (k + f)/255, k whole and 0 ≤ f < 1, the rounded values differ by k + 1 steps
+    with probability f, and by k otherwise.
+    """
+    steps = np.abs(errors) * 255
+    whole = np.floor(steps)
+    squares = whole**2 + (steps - whole) * (2 * whole + 1)
+    return float(np.mean(squares, dtype=np.float64)) / 255**2

@@ -1,0 +1,107 @@
+"""The files of a dataset: what each view writes, and what describes them all."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..cameras import Intrinsics
+from ..files import write_json
+from ..images import write_exr, write_picture
+from .llff import poses_bounds, write_llff
+from .noise import estimate, mean_image
+from .plan import Plan, View, depth_bounds
+from .tracer import TracedView
+
+SPLITS = ("train", "val", "test")
+
+
+def write_view(folder: Path, view: View, traced: TracedView, plan: Plan) -> dict[str, Any]:
+    """Writes the four pictures of a view; returns its entry of ``dataset.json``."""
+    samples = plan.halves
+    image = mean_image(*traced.halves, samples)
+    stem = folder / view.name
+    write_picture(_with(stem, ".png"), image)
+    write_exr(_with(stem, ".exr"), image)
+    write_exr(_with(stem, "_depth.exr"), traced.depth)
+    write_exr(_with(stem, "_normal.exr"), traced.normal)
+    bounds = depth_bounds(plan.intrinsics, traced.depth)
+    return {
+        "noise": estimate(*traced.halves, samples).record(),
+        "depth_bounds": None if bounds is None else list(bounds),
+        "sha256": {path.name: file_digest(path) for path in view_files(folder, view)},
+    }
+
+
+def view_files(folder: Path, view: View) -> list[Path]:
+    """The files of a view: colour in two forms, distance, normals."""
+    return [_with(folder / view.name, end) for end in (".png", ".exr", "_depth.exr", "_normal.exr")]
+
+
+def is_intact(folder: Path, view: View, entry: Any) -> bool:
+    """Whether all files of a view are as they were written."""
+    expected = entry.get("sha256", {}) if isinstance(entry, dict) else {}
+    return all(
+        path.is_file() and file_digest(path) == expected.get(path.name)
+        for path in view_files(folder, view)
+    )
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file, in hexadecimal."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def write_transforms(folder: Path, plan: Plan) -> None:
+    """Writes ``transforms_{split}.json`` for every split that has views."""
+    for split in SPLITS:
+        if views := plan.of_split(split):
+            frames = [_frame(view) for view in views]
+            write_json(
+                folder / f"transforms_{split}.json",
+                {**_camera(plan.intrinsics), "aabb": plan.box, "frames": frames},
+            )
+
+
+def write_forward_capture(folder: Path, plan: Plan, entries: dict[str, Any]) -> None:
+    """Writes ``poses_bounds.npy`` and ``images/``, which readers of LLFF expect."""
+    known = [entry["depth_bounds"] for entry in entries.values() if entry["depth_bounds"]]
+    everywhere = (min(b[0] for b in known), max(b[1] for b in known))
+    bounds = [entries[view.name]["depth_bounds"] or everywhere for view in plan.views]
+    rows = poses_bounds(
+        np.array([view.pose for view in plan.views]), plan.intrinsics, np.array(bounds)
+    )
+    write_llff(folder, [_with(folder / view.name, ".png") for view in plan.views], rows)
+
+
+def _frame(view: View) -> dict[str, Any]:
+    return {
+        "file_path": f"./{view.name}",
+        "transform_matrix": view.pose.tolist(),
+        "depth_file_path": f"./{view.name}_depth.exr",
+        "normal_file_path": f"./{view.name}_normal.exr",
+    }
+
+
+def _camera(camera: Intrinsics) -> dict[str, Any]:
+    """The camera in the keys of Blender's exporter and in those of nerfstudio."""
+    return {
+        # Rounded where the detour by the focal length leaves a trace.
+        "camera_angle_x": round(2 * math.atan(camera.width / (2 * camera.fx)), 12),
+        "camera_angle_y": round(2 * math.atan(camera.height / (2 * camera.fy)), 12),
+        "camera_model": "PINHOLE",
+        "fl_x": camera.fx,
+        "fl_y": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "w": camera.width,
+        "h": camera.height,
+    }
+
+
+def _with(stem: Path, end: str) -> Path:
+    return stem.with_name(stem.name + end)

@@ -1,0 +1,317 @@
+"""``mi-nerf generate``: a dataset folder from a scene, resumable, with known noise."""
+
+from __future__ import annotations
+
+import json
+import platform
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm.auto import tqdm
+
+from .. import __version__
+from ..errors import InputError
+from ..files import check_folder, make_folder, read_json, write_json
+from ..interrupts import interruptible
+from ..scene_file import SceneFile, visible_bounds
+from .output import (
+    SPLITS,
+    is_intact,
+    write_forward_capture,
+    write_transforms,
+    write_view,
+)
+from .plan import Plan, View, make_plan, protocol_name
+from .protocol import Options
+from .tracer import Tracer
+
+RECORD = "dataset.json"
+VERSION = 1
+
+_SECONDS_BETWEEN_SAVES = 5.0
+_SECONDS_BETWEEN_LINES = 10.0
+
+
+def generate(
+    scene: str | Path,
+    out: str | Path,
+    variant: str,
+    options: Options | None = None,
+    *,
+    parameters: Mapping[str, str] | None = None,
+    resume: bool = False,
+    show: bool = True,
+) -> dict[str, Any]:
+    """Path-traces a dataset from a Mitsuba scene.
+
+    Args:
+        scene: An XML file.
+        out: The dataset's folder: new, empty, or with ``resume`` one that this function
+            began, whose missing and damaged views are made again.
+        show: Say what is made, and how far it is.
+        variant: Mitsuba variant.
+        options: Views, size, samples, cameras.
+        parameters: Values of the scene's ``$parameters``.
+
+    Returns:
+        The content of ``dataset.json``; its ``complete`` is false after Ctrl-C.
+
+    Raises:
+        InputError: if anything is not as expected; existing files are as they were.
+    """
+    import mitsuba as mi
+
+    folder = Path(out)
+    _check_output(folder, resume)
+    mi.set_variant(variant)
+    with _quiet():
+        file = SceneFile(scene, parameters)
+        tracer, plan = prepare(file, options or Options())
+    record = json.loads(json.dumps(_describe(file, plan, variant)))  # as it will be read
+    if resume and (folder / RECORD).exists():
+        record["views"] = _resumed_views(folder, record, plan)
+    if show:
+        print(plan, flush=True)
+    return _trace_views(folder, tracer, plan, record, show)
+
+
+def summary(record: dict[str, Any]) -> str:
+    """What a finished or interrupted dataset holds, in one line."""
+    done, wanted = len(record["views"]), sum(record["settings"]["views"].values())
+    size = "x".join(str(n) for n in record["settings"]["size"])
+    if not record["complete"]:
+        return f"{done} of {wanted} views; interrupted, go on with --resume"
+    ceilings = [
+        f"{split} {noise['psnr_ceiling']:.2f} dB"
+        for split, noise in record["noise"].items()
+        if noise["psnr_ceiling"] is not None
+    ]
+    known = ", PSNR ceiling " + ", ".join(ceilings) if ceilings else ", free of noise"
+    return f"{done} views of {size}{known}"
+
+
+# ---- Before the first view ---------------------------------------------------
+
+
+def _check_output(folder: Path, resume: bool) -> None:
+    check_folder(folder)
+    if not folder.exists() or not any(folder.iterdir()):
+        return
+    if not resume:
+        hint = ", or --resume" if (folder / RECORD).exists() else ""
+        raise InputError(f"{folder}: holds files already, expected a new or empty folder{hint}")
+    if not (folder / RECORD).exists():
+        raise InputError(f"{folder}: holds no {RECORD}, expected a dataset begun by generate")
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Mitsuba's warnings about sensors and samplers that are replaced anyway."""
+    import mitsuba as mi
+
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(level)
+
+
+def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
+    """Loads the scene and decides what to make of it."""
+    import mitsuba as mi
+
+    hide = protocol_name(file, options) != "forward"
+    integrators = file.plugins("Integrator")
+    if hide:
+        for properties in integrators:
+            properties["hide_emitters"] = True
+    scene = file.load()
+    media = (shape.interior_medium() for shape in scene.shapes())
+    if not scene.emitters() and not any(hasattr(medium, "field") for medium in media):
+        raise InputError(f"{file.path}: has no emitter, all images would be black")
+    box = visible_bounds(scene)
+    if box is None or not np.ptp(np.array(box), axis=0).any():
+        raise InputError(f"{file.path}: its box is empty, expected shapes that can be seen")
+    plan = make_plan(file, scene, box, options)
+    integrator = scene.integrator()
+    if not integrators:
+        integrator = mi.load_dict({"type": "path", "hide_emitters": hide})
+    has_sampler = bool(file.plugins("Sampler")) and bool(file.plugins("Sensor"))
+    sampler = scene.sensors()[0].sampler() if has_sampler else mi.load_dict({"type": "independent"})
+    _check_sampler(sampler, plan)
+    return Tracer(scene, integrator, sampler, plan), plan
+
+
+def _check_sampler(sampler: Any, plan: Plan) -> None:
+    """Refuses numbers of samples that the sampler would quietly change."""
+    for count in plan.halves:
+        sampler.set_sample_count(count)
+        if sampler.sample_count() != count:
+            raise InputError(
+                f"--spp {plan.spp}: the scene's sampler '{sampler.class_name()}' cannot take "
+                f"half of them, {count}, expected e.g. {2 * sampler.sample_count()}"
+            )
+
+
+def _describe(file: SceneFile, plan: Plan, variant: str) -> dict[str, Any]:
+    """The record of a dataset without any view."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return {
+        "format": "mi_nerf.dataset",
+        "version": VERSION,
+        "complete": False,
+        "scene": {
+            "file": file.path.name,
+            "sha256": file.digest(),
+            "parameters": file.parameters,
+            "box": plan.box,
+        },
+        "settings": plan.record(),
+        "variant": variant,
+        "versions": {
+            "mi_nerf": __version__,
+            "mitsuba": mi.__version__,
+            "drjit": dr.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+        "noise": {},
+        "views": {},
+    }
+
+
+def _resumed_views(folder: Path, record: dict[str, Any], plan: Plan) -> dict[str, Any]:
+    """The views that are there and intact.
+
+    Raises:
+        InputError: if the folder holds another dataset.
+    """
+    path = folder / RECORD
+    found = read_json(path, "the record of a dataset")
+    if not isinstance(found, dict) or not isinstance(found.get("views"), dict):
+        raise InputError(f"{path}: expected the record of a dataset")
+    for key in ("format", "version", "scene", "settings", "variant", "versions"):
+        if found.get(key) != record[key]:
+            what = _difference(key, found.get(key), record[key])
+            raise InputError(f"{path}: holds another dataset: {what}")
+    views = found["views"]
+    return {v.name: views[v.name] for v in plan.views if is_intact(folder, v, views.get(v.name))}
+
+
+def _difference(name: str, found: Any, wanted: Any) -> str:
+    """Where two records first differ."""
+    if isinstance(found, dict) and isinstance(wanted, dict):
+        for key in wanted:
+            if found.get(key) != wanted[key]:
+                return _difference(f"{name}.{key}", found.get(key), wanted[key])
+    return f"{name} is {json.dumps(found)}, expected {json.dumps(wanted)}"
+
+
+# ---- View after view ---------------------------------------------------------
+
+
+def _trace_views(
+    folder: Path, tracer: Tracer, plan: Plan, record: dict[str, Any], show: bool
+) -> dict[str, Any]:
+    """Makes the views that ``record`` lacks, and then everything that describes them."""
+    missing = [view for view in plan.views if view.name not in record["views"]]
+    with interruptible() as interrupted, ThreadPoolExecutor(1) as writer:
+        # Before any folder is made: this is where scenes fail.
+        traced = tracer.trace(missing[0]) if missing else None
+        for split in SPLITS:
+            if plan.of_split(split):
+                make_folder(folder / split)
+        saver = _Saver(folder, plan, record)
+        writing: Future[None] | None = None
+        with _Progress(len(plan.views), len(record["views"]), show) as progress:
+            for i, view in enumerate(missing):
+                # Pictures of one view are written while the next one is traced.
+                current = traced if i == 0 else tracer.trace(view)
+                if writing is not None:
+                    writing.result()
+                    progress.update()
+                writing = writer.submit(saver.add, view, current)
+                if interrupted:
+                    break
+            if writing is not None:
+                writing.result()
+                progress.update()
+    if len(record["views"]) < len(plan.views):
+        saver.save()
+        return record
+    record["complete"] = True
+    write_transforms(folder, plan)
+    if plan.cameras == "forward":
+        write_forward_capture(folder, plan, record["views"])
+    saver.save()
+    return record
+
+
+class _Saver:
+    """Writes views, and now and then the record of those that are there."""
+
+    def __init__(self, folder: Path, plan: Plan, record: dict[str, Any]) -> None:
+        self._folder, self._plan, self._record = folder, plan, record
+        self.save()
+
+    def add(self, view: View, traced: Any) -> None:
+        self._record["views"][view.name] = write_view(self._folder, view, traced, self._plan)
+        if time.monotonic() - self._saved > _SECONDS_BETWEEN_SAVES:
+            self.save()
+
+    def save(self) -> None:
+        views = self._record["views"]
+        self._record["views"] = {v.name: views[v.name] for v in self._plan.views if v.name in views}
+        self._record["noise"] = _mean_noise(self._record["views"], self._plan)
+        write_json(self._folder / RECORD, self._record)
+        self._saved = time.monotonic()
+
+
+def _mean_noise(views: dict[str, Any], plan: Plan) -> dict[str, dict[str, float | None]]:
+    """Means over each split's views of the figures themselves, not of what they follow from."""
+    result: dict[str, dict[str, float | None]] = {}
+    for split in SPLITS:
+        noises = [views[v.name]["noise"] for v in plan.of_split(split) if v.name in views]
+        if noises:
+            result[split] = {key: _mean([n[key] for n in noises]) for key in noises[0]}
+    return result
+
+
+def _mean(values: list[float | None]) -> float | None:
+    """Without the views that are free of noise, whose PSNR is infinite."""
+    numbers = [value for value in values if value is not None]
+    return float(np.mean(numbers)) if numbers else None
+
+
+class _Progress:
+    """A bar with the time left on a terminal, a quiet line now and then elsewhere."""
+
+    def __init__(self, total: int, done: int, show: bool) -> None:
+        terminal = show and sys.stderr.isatty()
+        self._lines = show and not terminal
+        self._bar = tqdm(
+            total=total, initial=done, desc="generate", unit="view", disable=not terminal
+        )
+        self._total, self._done, self._last = total, done, time.monotonic()
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
+
+    def update(self) -> None:
+        self._bar.update()
+        self._done += 1
+        if self._lines and time.monotonic() - self._last > _SECONDS_BETWEEN_LINES:
+            print(f"{self._done} of {self._total} views", flush=True)
+            self._last = time.monotonic()

@@ -1,0 +1,102 @@
+"""Path-traces the views of a plan: one scene, one sensor that moves, no recompilation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..cameras import mitsuba_from_opengl, sensor_dict
+from ..errors import InputError
+from .plan import Plan, View
+from .surfaces import trace_surfaces
+
+Image = np.ndarray[Any, Any]
+
+# Samples that one call of mi.render traces at most: bounds its memory, and the time
+# until Ctrl-C is heard.
+_SAMPLES_PER_PASS = 1 << 24
+
+
+@dataclass(frozen=True)
+class TracedView:
+    """What was traced of one view."""
+
+    halves: tuple[Image, Image]  # two (H, W, 4) linear premultiplied RGBA, independent
+    depth: Image  # (H, W, 1) distance along the ray, scene units, 0: nothing
+    normal: Image  # (H, W, 3) world space, unit or 0
+
+
+class Tracer:
+    """Renders views of a loaded scene."""
+
+    def __init__(self, scene: Any, integrator: Any, sampler: Any, plan: Plan) -> None:
+        """``sampler`` must take each of ``plan.halves``."""
+        import mitsuba as mi
+
+        self._scene, self._integrator, self._plan = scene, integrator, plan
+        description = sensor_dict(
+            plan.intrinsics, np.eye(4), near_clip=1e-3 * plan.scale, far_clip=1e3 * plan.scale
+        )
+        self._sensor = mi.load_dict({**description, "sampler": sampler})
+        self._parameters = mi.traverse(self._sensor)
+        # Other samplers spread their points over all samples of a pixel.
+        self._in_parts = sampler.class_name() == "IndependentSampler"
+
+    def trace(self, view: View) -> TracedView:
+        """Renders one view.
+
+        Raises:
+            InputError: if the integrator gives NaN or infinity.
+        """
+        import mitsuba as mi
+
+        pose = mi.ScalarTransform4f(mitsuba_from_opengl(view.pose).tolist())
+        self._parameters["to_world"] = mi.Transform4f(pose)
+        self._parameters.update()
+        a, b = (self._half(view, half, n) for half, n in enumerate(self._plan.halves))
+        depth, normal = trace_surfaces(
+            self._scene,
+            self._plan.intrinsics,
+            view.pose,
+            hide_emitters=self._plan.hide_emitters,
+        )
+        return TracedView((a, b), depth, normal)
+
+    def _half(self, view: View, half: int, samples: int) -> Image:
+        """One of the two independent images of a view."""
+        total: Any = 0.0
+        parts = passes(samples, self._plan.pixels) if self._in_parts else [samples]
+        for i, count in enumerate(parts):
+            total = total + self._render(count, view.render_seed(half, i)) * np.float32(count)
+        image = total / np.float32(samples)
+        image = image[..., :4]  # what follows are AOVs
+        bad = int((~np.isfinite(image)).any(axis=-1).sum())
+        if bad:
+            raise InputError(f"view {view.name}: {bad} pixels are NaN or infinite")
+        return image
+
+    def _render(self, spp: int, seed: int) -> Image:
+        import mitsuba as mi
+
+        try:
+            image = mi.render(
+                self._scene,
+                sensor=self._sensor,
+                integrator=self._integrator,
+                spp=spp,
+                seed=seed,
+            )
+            return np.array(image)  # waits, so that passes do not pile up in memory
+        except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
+            if isinstance(error.__cause__, InputError):
+                raise error.__cause__ from error
+            raise
+
+
+def passes(samples: int, pixels: int) -> list[int]:
+    """``samples`` a pixel in parts that each trace a bounded number of paths."""
+    count = -(-samples * pixels // _SAMPLES_PER_PASS)
+    count = min(samples, max(1, count))
+    return [samples // count + (i < samples % count) for i in range(count)]

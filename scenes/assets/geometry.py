@@ -1,0 +1,65 @@
+"""What the scripts of this folder share: meshes as arrays, and files for Mitsuba.
+
+Every other script here makes the files of one scene. Run it again after a change:
+
+    python scenes/assets/bonsai.py            # beside the script
+    python scenes/assets/bonsai.py elsewhere/ # in another folder
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+Array = np.ndarray[Any, Any]
+
+
+def output_folder() -> Path:
+    """Where the script writes: its first argument, or beside itself."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def write_ply(
+    path: Path,
+    vertices: Array,
+    faces: Array,
+    *,
+    normals: Array | None = None,
+    uv: Array | None = None,
+) -> None:
+    """Writes a triangle mesh as binary PLY, the same bytes for the same arrays.
+
+    Args:
+        vertices: (V, 3) positions.
+        faces: (F, 3) vertex indices, counter-clockwise from outside.
+        normals: (V, 3) shading normals; without them Mitsuba computes smooth ones,
+            unless the shape says ``face_normals``.
+        uv: (V, 2) texture coordinates.
+    """
+    vertices, faces = np.asarray(vertices), np.asarray(faces)
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"{path}: a face names a vertex that does not exist")
+    names, columns = ["x", "y", "z"], [vertices]
+    if normals is not None:
+        names += ["nx", "ny", "nz"]
+        columns.append(normals)
+    if uv is not None:
+        names += ["u", "v"]
+        columns.append(uv)
+    table = np.hstack(columns).astype("<f4")
+    if not np.isfinite(table).all():
+        raise ValueError(f"{path}: a vertex is not finite")
+    short = len(table) <= 1 << 16  # two bytes an index do
+    triangles = np.empty(len(faces), [("count", "u1"), ("index", "<u2" if short else "<i4", 3)])
+    triangles["count"], triangles["index"] = 3, faces
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    header += [f"property float {name}" for name in names]
+    kind = "ushort" if short else "int"
+    header += [f"element face {len(faces)}", f"property list uchar {kind} vertex_indices"]
+    header += ["end_header", ""]
+    path.write_bytes("\n".join(header).encode() + table.tobytes() + triangles.tobytes())
