@@ -29,7 +29,8 @@ def write_picture(path: Path, image: Image) -> None:
         return
     pixels = np.rint(encoded(image) * 255).astype(np.uint8)
     with replacing(path) as temporary:
-        iio.imwrite(temporary, pixels, extension=".png")
+        # A quarter faster than the usual level 6, for about 1 % more bytes.
+        iio.imwrite(temporary, pixels, extension=".png", compress_level=3)
 
 
 def write_exr(path: Path, image: Image) -> None:

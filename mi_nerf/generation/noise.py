@@ -50,12 +50,15 @@ def estimate(a: Image, b: Image, samples: tuple[int, int]) -> Noise:
         samples: Samples a pixel of each.
     """
     scale = math.sqrt(samples[0] * samples[1]) / sum(samples)
+    count = a[..., :3].size
+    noisy = (a != b).any(axis=-1)  # empty background has no error
+    a, b = a[noisy], b[noisy]
     linear = (a[..., :3] - b[..., :3]) * scale
     display = (on_white(a) - on_white(b)) * scale
     return Noise(
-        mse_linear=_mean_square(linear),
-        mse_srgb=_mean_square(display),
-        mse_8bit=_rounded_mean_square(display),
+        mse_linear=_sum(np.square(linear)) / count,
+        mse_srgb=_sum(np.square(display)) / count,
+        mse_8bit=_sum(_rounded_squares(display)) / count,
     )
 
 
@@ -70,11 +73,11 @@ def on_white(image: Image) -> Image:
     return straight[..., :3] * straight[..., 3:] + (1 - straight[..., 3:])
 
 
-def _mean_square(values: Image) -> float:
-    return float(np.mean(np.square(values), dtype=np.float64))
+def _sum(values: Image) -> float:
+    return float(np.sum(values, dtype=np.float64))
 
 
-def _rounded_mean_square(errors: Image) -> float:
+def _rounded_squares(errors: Image) -> Image:
     """E[(round(u + e) − round(u))²] over u uniform within a step of 1/255.
 
     With |e| = (k + f)/255, k whole and 0 ≤ f < 1, the rounded values differ by k + 1 steps
@@ -82,5 +85,5 @@ def _rounded_mean_square(errors: Image) -> float:
     """
     steps = np.abs(errors) * 255
     whole = np.floor(steps)
-    squares = whole**2 + (steps - whole) * (2 * whole + 1)
-    return float(np.mean(squares, dtype=np.float64)) / 255**2
+    squares: Image = (whole**2 + (steps - whole) * (2 * whole + 1)) / 255**2
+    return squares

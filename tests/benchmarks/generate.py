@@ -70,9 +70,9 @@ def main() -> None:
     variant = choose_variant(options.variant)
     print(f"{machine()}, {variant}, mi_nerf {mi_nerf.__version__}")
     print(f"{options.scene}, {options.views} views of {options.size}^2, {options.spp} spp")
+    _kernels(options, variant)  # first: what follows fills the kernel cache
     if options.repeats:
         _speed(options, variant)
-    _kernels(options, variant)
     _noise(options, variant)
 
 
