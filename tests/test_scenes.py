@@ -9,10 +9,12 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 import pytest
 
 from mi_nerf.backend import choose_variant
-from mi_nerf.generation import PROTOCOLS
+from mi_nerf.data import load_dataset
+from mi_nerf.generation import PROTOCOLS, Options, generate
 from mi_nerf.scene_file import SceneFile, visible_bounds
 from mi_nerf.scene_library import find_scene, scene_folder, scenes
 
@@ -123,3 +125,61 @@ def same_content(made: Path, kept: Path) -> None:
         return
     a, b = (p.read_text().split() for p in (made, kept))
     assert len(a) == len(b)
+
+
+# ---- Scenes of which the answer is known -------------------------------------
+
+
+def one_view(name: str, folder: Path, spp: int, size: int = 48) -> tuple[np.ndarray, ...]:
+    """Image, distance, and the pixels' central rays of a generated view."""
+    options = Options(train=1, val=0, test=0, size=(size, size), spp=spp, seed=2)
+    generate(find_scene(name), folder, VARIANT, options, show=False)
+    image, depth = (
+        next(iter(OpenEXR.File(str(folder / f"train/r_0{end}.exr")).channels().values())).pixels
+        for end in ("", "_depth")
+    )
+    views = load_dataset(folder, "train")
+    pose, camera = views.cam_to_world[0], views.intrinsics
+    y, x = np.mgrid[:size, :size] + 0.5
+    local = [(x - camera.cx) / camera.fx, (camera.cy - y) / camera.fy, -np.ones_like(x)]
+    d = np.stack(local, -1) @ pose[:3, :3].T
+    return image, depth, pose[:3, 3], d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
+def test_blob_has_the_stated_integral(tmp_path: Path) -> None:
+    image, _, o, d = one_view("blob", tmp_path / "data", 64)
+    b2 = o @ o - (d @ o) ** 2
+    opacity = -np.expm1(-12 * 0.2 * np.sqrt(2 * np.pi) * np.exp(-b2 / (2 * 0.2**2)))
+    # A pixel shows the mean over its area: within what the opacity changes across it.
+    slope = np.hypot(*np.gradient(opacity))
+    assert (np.abs(image[..., 3] - opacity) <= 0.02 + 0.3 * slope).all()
+    assert np.abs(image[..., 3] - opacity).mean() < 3e-3
+    for channel, radiance in enumerate((1.6, 0.55, 0.16)):
+        assert image[..., channel] == pytest.approx(radiance * image[..., 3], abs=1e-3)
+
+
+def test_fog_has_the_stated_transmittance(tmp_path: Path) -> None:
+    """Where a ray meets nothing but fog, alpha is what the fog keeps back."""
+    image, depth, o, d = one_view("fog", tmp_path / "data", 512)
+    lower, upper = np.array([-0.8, -0.8, -0.6]), np.array([0.8, 0.8, -0.05])
+    t = np.stack([(lower - o) / d, (upper - o) / d])
+    near, far = t.min(0).max(-1), t.max(0).min(-1)
+    length = np.maximum(far - near, 0)
+    # Not near the edges of things: alpha is a mean over the pixel, depth its centre.
+    empty = np.pad(depth, 1, mode="edge") == 0
+    shifted = [empty[1 + i : 49 + i, 1 + j : 49 + j] for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    alone = np.logical_and.reduce(shifted) & (length > 0.02)
+    expected = -np.expm1(-2 * length[alone])
+    assert alone.sum() > 20 and np.ptp(expected) > 0.2
+    found = image[..., 3][alone]
+    noise = np.sqrt(expected * (1 - expected) / 512)
+    slope = np.hypot(*np.gradient(-np.expm1(-2 * length)))[alone]
+    assert (np.abs(found - expected) <= 5 * noise + slope).all()
+    assert abs((found - expected).mean()) < 0.02
+
+
+def test_hdr_spans_four_decades(tmp_path: Path) -> None:
+    image, _, _, _ = one_view("hdr", tmp_path / "data", 256, size=64)
+    seen = image[..., 3] > 0.99
+    luminance = image[..., :3][seen] @ [0.2126, 0.7152, 0.0722]
+    assert luminance.max() > 1e4 * np.quantile(luminance, 0.1)
