@@ -52,8 +52,7 @@ class Generate:
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """Folder of the dataset: new or empty, or with --resume one that was begun."""
     protocol: Literal["realistic360", "diffuse360", "forward"] | None = None
-    """Numbers of views, size and cameras of the paper's datasets; default: the scene's own,
-    or realistic360."""
+    """The paper's kind of dataset; default: the scene's own, or realistic360."""
     train: int | None = None
     """Training views; default: the protocol's (100, 479, 28)."""
     val: int | None = None
@@ -69,15 +68,13 @@ class Generate:
     resume: bool = False
     """Go on with the dataset in OUT; missing and damaged views are made again."""
     cameras: Literal["hemisphere", "sphere"] | None = None
-    """Where the cameras of the 360-degree protocols stand; default: as the scene says, or on
-    the hemisphere."""
+    """Where 360-degree cameras stand; default: as the scene says, or hemisphere."""
     up: Literal["x", "y", "z"] | None = None
     """Vertical axis; default: that of the scene's sensor, or z."""
     center: tuple[float, float, float] | None = None
-    """What the cameras look at; default: the origin for scenes in [-1, 1]^3, the middle of the
-    scene's box for others."""
+    """What cameras look at; default: the origin, or the middle of scenes beyond [-1, 1]^3."""
     radius: float | None = None
-    """Their distance from it; default: 4 for scenes in [-1, 1]^3, in proportion for others."""
+    """Their distance from it; default: 4, or in proportion for scenes beyond [-1, 1]^3."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Values of the scene's $parameters: name=value; repeatable."""
     variant: Variant = None

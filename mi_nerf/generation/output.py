@@ -14,7 +14,8 @@ from ..files import write_json
 from ..images import write_exr, write_picture
 from .llff import poses_bounds, write_llff
 from .noise import estimate, mean_image
-from .plan import Plan, View, depth_bounds
+from .plan import Plan, View
+from .surfaces import depth_bounds
 from .tracer import TracedView
 
 SPLITS = ("train", "val", "test")

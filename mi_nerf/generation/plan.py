@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..scene_file import Bounds, SceneFile
 from . import viewpoints
 from .protocol import CAMERA_ANGLE_X, HOLD_OUT, PROTOCOLS, RADIUS, Cameras, Options
-from .surfaces import trace_surfaces
+from .surfaces import depth_bounds, trace_surfaces
 
 Array = np.ndarray[Any, Any]
 
@@ -21,7 +21,6 @@ _DEFAULT_SPP = 128  # of scenes whose sensor has no sampler
 _UNIT_BOX = 1.001  # a scene inside [-1, 1]^3, but for rounding, gets the paper's cameras
 # Forward-facing views: how far cameras move sideways, per distance of the nearest content.
 _SPREAD = 0.4
-_NEAR_QUANTILE, _FAR_QUANTILE = 0.001, 0.999
 
 
 @dataclass(frozen=True)
@@ -323,19 +322,6 @@ def _nearest(scene: Any, intrinsics: Intrinsics, pose: Array) -> float:
     if bounds is None:
         raise InputError("the scene's sensor sees nothing, expected content before it")
     return bounds[0]
-
-
-def depth_bounds(intrinsics: Intrinsics, depth: Array) -> tuple[float, float] | None:
-    """Near and far z-depth of an image of distances along rays; ``None`` if all are 0."""
-    y, x = np.mgrid[: intrinsics.height, : intrinsics.width] + 0.5
-    right = (x - intrinsics.cx) / intrinsics.fx
-    up = (y - intrinsics.cy) / intrinsics.fy
-    z = depth[..., 0] / np.sqrt(1 + right**2 + up**2)
-    seen = z[depth[..., 0] > 0]
-    if not seen.size:
-        return None
-    near, far = np.quantile(seen, [_NEAR_QUANTILE, _FAR_QUANTILE])
-    return float(near), float(far)
 
 
 def _hold_out(poses: Array, counts: dict[str, int], seed: int) -> tuple[View, ...]:

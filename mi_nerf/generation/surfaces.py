@@ -13,6 +13,7 @@ from ..cameras import Intrinsics, pack_poses, pixel_rays
 Image = np.ndarray[Any, Any]
 
 _STEP = 1e-4  # past a surface, relative to the distance from the origin
+_NEAR_QUANTILE, _FAR_QUANTILE = 0.001, 0.999
 _MAX_INTERFACES = 64  # that a ray may pass before it counts as lost
 
 
@@ -43,6 +44,19 @@ def trace_surfaces(
         np.array(depth).reshape(height, width, 1),
         np.array(normal).T.reshape(height, width, 3),
     )
+
+
+def depth_bounds(intrinsics: Intrinsics, depth: Image) -> tuple[float, float] | None:
+    """Near and far z-depth of an image of distances along rays; ``None`` if all are 0."""
+    y, x = np.mgrid[: intrinsics.height, : intrinsics.width] + 0.5
+    right = (x - intrinsics.cx) / intrinsics.fx
+    up = (y - intrinsics.cy) / intrinsics.fy
+    z = depth[..., 0] / np.sqrt(1 + right**2 + up**2)
+    seen = z[depth[..., 0] > 0]
+    if not seen.size:
+        return None
+    near, far = np.quantile(seen, [_NEAR_QUANTILE, _FAR_QUANTILE])
+    return float(near), float(far)
 
 
 @dr.syntax  # type: ignore[untyped-decorator]
