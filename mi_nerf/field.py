@@ -102,6 +102,8 @@ class NeuralFieldConfig:
 class NeuralField:
     """Fourier features into an MLP (NeRF Sec. 4 and 5.1), behind the Field protocol."""
 
+    coarse: NeuralField | None = None  # says where this one is worth sampling (Sec. 5.2)
+
     def __init__(
         self,
         config: NeuralFieldConfig,

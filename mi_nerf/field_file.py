@@ -29,10 +29,13 @@ class FieldFile:
     occupancy: np.ndarray[Any, Any] | None = None  # (X, Y, Z) booleans over the box
     march: MarchSettings = field(default_factory=MarchSettings)  # sampling that suits the field
     provenance: dict[str, Any] = field(default_factory=dict)  # free-form, for people
+    coarse: Arrays | None = None  # weights of the coarse network, of the same architecture
 
     def build(self, backend: Any) -> tuple[NeuralField, OccupancyGrid | None]:
         """Uploads the field to a backend (``drjit.llvm.ad``, or ``mitsuba`` with a variant)."""
         neural = NeuralField(self.config, self.weights, backend.TensorXf)
+        if self.coarse is not None:
+            neural.coarse = NeuralField(self.config, self.coarse, backend.TensorXf)
         if self.occupancy is None:
             return neural, None
         grid = OccupancyGrid(neural.lower, neural.upper, self.occupancy, backend.Float)
@@ -42,9 +45,11 @@ class FieldFile:
 def save_field(path: str | Path, contents: FieldFile) -> None:
     """Writes a field file, atomically."""
     arrays = {f"weights.{name}": array for name, array in contents.weights.items()}
+    if contents.coarse is not None:
+        arrays |= {f"coarse.{name}": array for name, array in contents.coarse.items()}
     if contents.occupancy is not None:
         arrays["occupancy"] = np.packbits(contents.occupancy)
-    march = {k: getattr(contents.march, k) for k in ("samples", "near", "far")}
+    march = {k: getattr(contents.march, k) for k in ("samples", "fine", "near", "far")}
     description = {
         "field": {"kind": "fourier", **dataclasses.asdict(contents.config)},
         "density_unit": "1/scene unit",
@@ -65,22 +70,27 @@ def load_field(path: str | Path) -> FieldFile:
     arrays, description = read_tensors(path, kind="field", version=VERSION)
     try:
         config = _field_config(description["field"])
-        weights = {
-            name.removeprefix("weights."): array
-            for name, array in arrays.items()
-            if name.startswith("weights.")
-        }
+        weights, coarse = _prefixed(arrays, "weights."), _prefixed(arrays, "coarse.")
         occupancy = None
         if description["occupancy_shape"] is not None:
             occupancy = _unpack(arrays["occupancy"], tuple(description["occupancy_shape"]))
         march = MarchSettings(**description["march"])
-        contents = FieldFile(config, weights, occupancy, march, description["provenance"])
+        contents = FieldFile(
+            config, weights, occupancy, march, description["provenance"], coarse or None
+        )
     except KeyError as error:
         raise InputError(f"{path}: damaged field description: {error} is missing") from error
     except (TypeError, ValueError) as error:
         raise InputError(f"{path}: damaged field description: {error}") from error
-    _check_weights(path, contents)
+    for group in (contents.weights, contents.coarse):
+        if group is not None:
+            _check_weights(path, contents.config, group)
     return contents
+
+
+def _prefixed(arrays: Arrays, prefix: str) -> Arrays:
+    """The arrays whose names begin with ``prefix``, without it."""
+    return {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
 
 
 def _unpack(packed: np.ndarray[Any, Any], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
@@ -103,16 +113,16 @@ def _field_config(data: dict[str, Any]) -> NeuralFieldConfig:
     return NeuralFieldConfig(**values)
 
 
-def _check_weights(path: str | Path, contents: FieldFile) -> None:
-    shapes = contents.config.shapes()
-    found = {name: array.shape for name, array in contents.weights.items()}
+def _check_weights(path: str | Path, config: NeuralFieldConfig, weights: Arrays) -> None:
+    shapes = config.shapes()
+    found = {name: array.shape for name, array in weights.items()}
     for name in sorted(shapes.keys() | found.keys()):
         if shapes.get(name) != found.get(name):
             raise InputError(
                 f"{path}: tensor '{name}' is {found.get(name, 'missing')}, "
                 f"expected {shapes.get(name, 'no such tensor')}"
             )
-    for name, array in contents.weights.items():
+    for name, array in weights.items():
         if array.dtype.kind != "f":
             raise InputError(
                 f"{path}: tensor '{name}' holds {array.dtype}, expected floating-point numbers"

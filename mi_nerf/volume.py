@@ -1,6 +1,7 @@
 """Renders rays through a field: the one path that training, evaluation and plugins share.
 
     rays → interval in the box → strata → (cells that may hold something)
+         → (where the coarse network sees something: NeRF Sec. 5.2)
          → field, in blocks of constant size → quadrature
 
 The field sees its queries in blocks of a constant number of columns, so tensor-mode
@@ -20,8 +21,16 @@ import drjit as dr
 from .arrays import gather_vector3
 from .field import Field
 from .occupancy import OccupancyGrid
-from .quadrature import Composite, composite
-from .sampling import box_interval, clip_interval, points_along, stratified
+from .quadrature import Composite, composite, sample_weights
+from .sampling import (
+    box_interval,
+    cell_widths,
+    clip_interval,
+    inverse_transform,
+    merge_sorted,
+    points_along,
+    stratified,
+)
 
 
 @dataclass(frozen=True)
@@ -29,6 +38,7 @@ class MarchSettings:
     """How rays are sampled."""
 
     samples: int = 128  # strata a ray
+    fine: int = 0  # samples more, placed by the field's coarse network, if it has one
     near: float | None = None  # lower bound of t, in scene units; None: the box alone
     far: float | None = None  # upper bound of t
     block: int = 16384  # queries a network evaluation
@@ -38,6 +48,8 @@ class MarchSettings:
         for name in ("samples", "block", "chunk"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}, expected at least 1")
+        if self.fine < 0:
+            raise ValueError(f"fine={self.fine}, expected 0 or more")
         if self.near is not None and self.far is not None and not self.near < self.far:
             raise ValueError(f"near={self.near} must be smaller than far={self.far}")
 
@@ -51,7 +63,10 @@ class Samples:
     t: Any  # R·S sample parameters
     delta: Any  # R·S interval lengths
     count: int  # S
-    index: Any  # the M samples to evaluate, ascending
+    near: Any  # R bounds of t
+    far: Any
+    index: Any = None  # the M samples to evaluate, ascending
+    coarse_queries: int = 0  # of the coarse network, by which the samples were placed
 
     @property
     def rays(self) -> int:
@@ -98,14 +113,52 @@ def place_samples(
         if bounds is not None:
             near, far, hit = clip_interval(near, far, hit, *bounds)
         t, delta = stratified(near, far, settings.samples, jitter)
-        dr.eval(t, delta)
-        uint = dr.uint32_array_t(type(t))
-        ray = dr.arange(uint, len(t)) // settings.samples
-        wanted = dr.gather(dr.mask_t(type(t)), hit, ray)
-        if occupancy is not None:
-            wanted &= occupancy.occupied(points_along(o, d, t, ray))
-        index = uint(dr.compress(wanted))
-    return Samples(o, d, t, delta, settings.samples, index)
+        samples = _select(Samples(o, d, t, delta, settings.samples, near, far), hit, occupancy)
+        coarse = getattr(field, "coarse", None)
+        if coarse is None or not settings.fine:
+            return samples
+        evaluation = Evaluation(coarse, samples, settings.block)
+        weights, _ = sample_weights(evaluation.density, delta, settings.samples)
+        shift = jitter if jitter is not None and len(jitter) == samples.rays else None
+        return refine(samples, weights, settings.fine, occupancy, shift)
+
+
+def refine(
+    samples: Samples,
+    weights: Any,
+    fine: int,
+    occupancy: OccupancyGrid | None = None,
+    jitter: Any = None,
+) -> Samples:
+    """Adds ``fine`` samples a ray where ``weights`` are large (NeRF Sec. 5.2).
+
+    Args:
+        samples: the coarse samples, one in each of equal strata.
+        weights: theirs; without gradient.
+        jitter: R·F numbers in [0, 1), or R to shift all of a ray alike; ``None`` for the
+            middle of the strata of the cumulative distribution.
+    """
+    with dr.suspend_grad():
+        o, d, near, far, count = samples.o, samples.d, samples.near, samples.far, samples.count
+        more = inverse_transform(near, far, dr.detach(weights), count, fine, jitter)
+        t = merge_sorted(samples.t, more, count, fine)
+        delta = cell_widths(t, near, far, count + fine)
+        merged = Samples(o, d, t, delta, count + fine, near, far)
+        merged.coarse_queries = samples.queries
+        return _select(merged, far > near, occupancy)
+
+
+def _select(samples: Samples, hit: Any, occupancy: OccupancyGrid | None) -> Samples:
+    """Keeps for evaluation the samples that may lie in something."""
+    dr.eval(samples.t, samples.delta, samples.near, samples.far)
+    t = samples.t
+    uint = dr.uint32_array_t(type(t))
+    ray = dr.arange(uint, len(t)) // samples.count
+    wanted = dr.gather(dr.mask_t(type(t)), hit, ray)
+    if occupancy is not None:
+        wanted &= occupancy.occupied(points_along(samples.o, samples.d, t, ray))
+    samples.index = uint(dr.compress(wanted))
+    return samples
 
 
 class Evaluation:
@@ -212,12 +265,12 @@ class RayImage:
     color: list[Any]  # three arrays of R values, premultiplied by the opacity
     opacity: Any
     depth: Any  # distance along the unit ray, scene units; 0 where nothing is seen
-    queries: int  # how often the field was asked
+    queries: int  # how often its networks were asked
 
 
 def ray_chunks(rays: int, settings: MarchSettings) -> Iterator[tuple[int, int]]:
     """Splits R rays into ranges whose samples fit in ``settings.chunk``."""
-    size = max(1, settings.chunk // settings.samples)
+    size = max(1, settings.chunk // (settings.samples + settings.fine))
     for start in range(0, rays, size):
         yield start, min(size, rays - start)
 
@@ -253,7 +306,7 @@ def render_rays(
             for output, value in zip(outputs, values, strict=True):
                 dr.scatter(output, value, index)
             dr.eval(outputs)
-            queries += samples.queries
+            queries += samples.queries + samples.coarse_queries
     return RayImage(outputs[:3], outputs[3], outputs[4], queries)
 
 

@@ -19,6 +19,7 @@ import pytest
 
 from mi_nerf.data import Dataset, load_dataset
 from mi_nerf.errors import InputError
+from mi_nerf.field import NeuralFieldConfig
 from mi_nerf.field_file import load_field
 from mi_nerf.quadrature import over_background
 from mi_nerf.training import run as training
@@ -28,7 +29,7 @@ from mi_nerf.training.presets import preset
 from mi_nerf.training.run import TrainingError
 from mi_nerf.training.schedule import learning_rate
 from mi_nerf.training.trainer import Trainer, resolved_octaves
-from mi_nerf.volume import Evaluation, integrate, place_samples, render_rays
+from mi_nerf.volume import Evaluation, integrate, place_samples, refine, render_rays
 from tests.datasets import write_blob_dataset
 
 SIZE, VIEWS = 20, 6
@@ -353,3 +354,108 @@ def test_the_field_file_takes_the_occupancy_along(data: Path, tmp_path: Path) ->
     trained = render_rays(run.trainer.field, o, d, march, occupancy=run.trainer.occupancy)
     assert loaded.queries == trained.queries < render_rays(field, o, d, march).queries
     np.testing.assert_array_equal(np.array(loaded.opacity), np.array(trained.opacity))
+
+
+# --------------------------------------------------------------------------
+#   Coarse and fine network
+# --------------------------------------------------------------------------
+
+FINE = ("sampling.samples=12", "sampling.fine=12", "sampling.render_samples=12")
+
+
+def test_the_loss_is_that_of_both_networks(views: Dataset) -> None:
+    """NeRF Eq. 6 by hand: coarse samples, then all samples, each with its own network."""
+    config = small(*FINE, "sampling.rays=64", "sampling.batch=100000", "occupancy.enabled=False")
+    trainer = Trainer(config, views, ad)
+    before = {name: np.array(t) for name, t in trainer.parameters.items()}
+    field, coarse = trainer.field, trainer.field.coarse
+    rng = step_rng(ad.Float, config.seed, 0)
+    batch = trainer._source.draw(64, rng)
+    jitter = rng.random(ad.Float, 64 * 12)
+    first = place_samples(field, batch.o, batch.d, trainer.march_settings(), jitter=jitter)
+    seen = [integrate(Evaluation(coarse, first, 1024), first)]
+    second = refine(first, seen[0].weights, 12, jitter=rng.random(ad.Float, 64 * 12))
+    assert second.count == 24 and second.coarse_queries == first.queries
+    seen.append(integrate(Evaluation(field, second, 1024), second))
+    target = over_background(batch.color, batch.alpha, batch.background)
+    errors = []
+    for image in seen:
+        predicted = over_background(image.color, image.opacity, batch.background)
+        pairs = zip(predicted, target, strict=True)
+        errors.append(np.mean(sum(np.square(np.array(p - t)) for p, t in pairs) / 3))
+    result = trainer.step(1e-2)
+    assert float(result.loss[0]) == pytest.approx(sum(errors), rel=1e-5)
+    assert float(result.mse[0]) == pytest.approx(errors[1], rel=1e-5)
+    assert result.queries == first.queries + second.queries
+    for name, tensor in trainer.parameters.items():
+        assert np.abs(np.array(tensor) - before[name]).max() > 0, name
+
+
+def test_sample_positions_are_detached(views: Dataset) -> None:
+    """The coarse network learns from its own image alone: the fine one has no say."""
+    config = small(*FINE, "sampling.rays=64", "sampling.batch=100000", "occupancy.enabled=False")
+    runs = []
+    for factor in (1.0, 0.0):
+        trainer = Trainer(config, views, ad)
+        for name, tensor in trainer.field.parameters().items():
+            trainer.optimizer.assign(name, tensor * factor)
+        runs.append(trainer)
+        trainer.optimizer.zero_grad()
+        rng = step_rng(ad.Float, config.seed, 0)
+        batch = trainer._source.draw(64, rng)
+        jitter = rng.random(ad.Float, 64 * 12)
+        samples = place_samples(
+            trainer.field, batch.o, batch.d, trainer.march_settings(), jitter=jitter
+        )
+        trainer._differentiate(batch, samples, rng)
+    a, b = ({n: np.array(dr.grad(t)) for n, t in run.parameters.items()} for run in runs)
+    for name, gradient in a.items():
+        if name.startswith("coarse."):
+            np.testing.assert_allclose(b[name], gradient, rtol=1e-4, atol=1e-8)
+
+
+def test_fine_samples_gather_at_the_surface(data: Path, tmp_path: Path) -> None:
+    config = small(*FINE, "sampling.batch=2048", "occupancy.enabled=False", steps=300)
+    run = training.start(data, tmp_path / "run", config, "llvm_ad_rgb")
+    run.train(show_bar=False)
+    contents = load_field(tmp_path / "run/field.safetensors")
+    assert contents.march.samples == contents.march.fine == 12 and contents.coarse is not None
+    field, _ = contents.build(ad)
+    o, d = ad.Array3f([0, 0.1], [-4, -4], [0, 0.2]), ad.Array3f([0, 0], [1, 1], [0, 0])
+    samples = place_samples(field, o, d, contents.march)
+    t = np.array(samples.t).reshape(2, 24)
+    assert (np.diff(t, axis=1) >= 0).all()
+    uniform = place_samples(field, o, d, replace(contents.march, fine=0, samples=24))
+    surface = 4 - 0.8  # of the ball, about
+    near = [np.mean(np.abs(np.array(s.t) - surface) < 0.3) for s in (samples, uniform)]
+    assert near[0] > 1.2 * near[1]
+    seen = render_rays(field, o, d, contents.march)
+    assert seen.queries == samples.queries + samples.coarse_queries
+    again = render_rays(field, o, d, contents.march)
+    assert (np.array(seen.color[0]) == np.array(again.color[0])).all()  # no chance involved
+
+
+def test_resuming_both_networks_is_exact(data: Path, tmp_path: Path) -> None:
+    config = small(*FINE, steps=20)
+    through = training.start(data, tmp_path / "a", config, "llvm_ad_rgb")
+    through.train(show_bar=False)
+    halves = training.start(data, tmp_path / "b", config, "llvm_ad_rgb")
+    for _ in range(9):
+        halves._advance()
+    halves._settle()
+    halves.save()
+    resumed = training.start(data, tmp_path / "b", small(), "llvm_ad_rgb", resume=True)
+    resumed.train(show_bar=False)
+    assert any(name.startswith("coarse.") for name in through.trainer.parameters)
+    for name, expected in through.trainer.parameters.items():
+        np.testing.assert_array_equal(np.array(resumed.trainer.parameters[name]), expected)
+
+
+def test_the_paper_trains_two_published_networks() -> None:
+    config = preset("paper")
+    assert (config.sampling.samples, config.sampling.fine) == (64, 128)
+    assert config.sampling.rays == 4096 and config.network.skip == 5
+    field = NeuralFieldConfig(
+        network=config.network, position=config.position, direction=config.direction
+    )
+    assert field.parameter_count() == 595_844

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..arrays import upload
 from ..errors import InputError
 from ..tensor_file import read_tensors, write_tensors
@@ -22,7 +24,7 @@ def save_checkpoint(path: str | Path, trainer: Trainer, progress: dict[str, Any]
     Args:
         progress: what the loop around the trainer has to remember, as JSON values.
     """
-    arrays = {f"weights.{n}": a for n, a in trainer.field.weights().items()}
+    arrays = {f"weights.{n}": np.array(t) for n, t in trainer.parameters.items()}
     arrays |= {f"adam.{n}": a for n, a in trainer.optimizer.state().items()}
     if trainer.occupancy is not None:
         arrays["occupancy.values"] = trainer.occupancy.values()
@@ -50,8 +52,7 @@ def load_checkpoint(path: str | Path, trainer: Trainer) -> dict[str, Any]:
     try:
         trainer.attempt = description["attempt"]
         trainer.reset()
-        parameters = trainer.field.parameters()
-        for name, tensor in parameters.items():
+        for name, tensor in trainer.parameters.items():
             saved = arrays[f"weights.{name}"]
             if saved.shape != tensor.shape:
                 raise ValueError(f"tensor '{name}' is {saved.shape}, expected {tensor.shape}")

@@ -51,7 +51,9 @@ class SamplingConfig:
     """Rays and the samples on them."""
 
     samples: int = 64  # strata a ray in training
+    fine: int = 0  # samples more, where a second, coarse network sees something (0: no such)
     render_samples: int = 128  # strata a ray in evaluation, and what the field file suggests
+    render_fine: int | None = None  # samples more in evaluation; none: as in training
     batch: int = 32768  # field queries a step, at most
     max_rays: int = 16384  # rays a step, at most
     rays: int | None = None  # rays a step; none: as many as fill the batch
@@ -61,7 +63,7 @@ class SamplingConfig:
 
     def __post_init__(self) -> None:
         require(self, "samples render_samples batch max_rays rays block", at_least=1)
-        require(self, "near", at_least=0)
+        require(self, "near fine render_fine", at_least=0)
         require(self, "far", above=0)
         if self.batch < self.samples:
             raise ValueError(

@@ -7,7 +7,7 @@ decision is taken on the device.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from typing import Any
 
 import drjit as dr
@@ -16,12 +16,36 @@ import numpy as np
 from ..arrays import upload
 
 
+class JointParameters(MutableMapping[str, Any]):
+    """Several dictionaries of tensors as one: ``prefix + name`` for each."""
+
+    def __init__(self, groups: Mapping[str, dict[str, Any]]) -> None:
+        self._places = {f"{p}{n}": (group, n) for p, group in groups.items() for n in group}
+
+    def __getitem__(self, name: str) -> Any:
+        group, own = self._places[name]
+        return group[own]
+
+    def __setitem__(self, name: str, tensor: Any) -> None:
+        group, own = self._places[name]
+        group[own] = tensor
+
+    def __delitem__(self, name: str) -> None:
+        raise TypeError("parameters are not removed")
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._places)
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+
 class Adam:
     """Updates a dictionary of tensors in place from their gradients."""
 
     def __init__(
         self,
-        parameters: dict[str, Any],
+        parameters: MutableMapping[str, Any],
         *,
         beta1: float = 0.9,
         beta2: float = 0.999,
@@ -62,7 +86,7 @@ class Adam:
             self._first[name] = dr.select(accept, m_new, m)
             self._second[name] = dr.select(accept, v_new, v)
             self._renew(name, dr.select(accept, new, dr.detach(old)))
-        dr.schedule(self._parameters, self._first, self._second)
+        dr.schedule(list(self._parameters.values()), self._first, self._second)
         dr.eval()
         return accept
 

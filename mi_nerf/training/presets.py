@@ -27,14 +27,14 @@ def nerf() -> TrainConfig:
 
 
 def paper() -> TrainConfig:
-    """The published architecture and schedule, one network (NeRF Sec. 5.3)."""
+    """The published model and schedule: coarse and fine network (NeRF Sec. 5.2 and 5.3)."""
     return TrainConfig(
         preset="paper",
         background="white",
         position=FourierEncoding(frequencies=10),
         density=DensityConfig(activation="relu", shift=0.0),
         occupancy=OccupancyConfig(enabled=False, hull=False),
-        sampling=SamplingConfig(samples=192, render_samples=192, rays=4096, batch=1 << 20),
+        sampling=SamplingConfig(samples=64, fine=128, render_samples=64, rays=4096, batch=1 << 21),
         optimizer=OptimizerConfig(warmup=0, beta2=0.999, epsilon=1e-7),
     )
 

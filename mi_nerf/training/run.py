@@ -137,8 +137,14 @@ class Run:
             trainer.field_config,
             trainer.field.weights(),
             trainer.occupancy.mask() if trainer.occupancy is not None else None,
-            MarchSettings(samples=sampling.render_samples, near=sampling.near, far=sampling.far),
+            MarchSettings(
+                samples=sampling.render_samples,
+                fine=sampling.fine if sampling.render_fine is None else sampling.render_fine,
+                near=sampling.near,
+                far=sampling.far,
+            ),
             {"mi_nerf": __version__, "preset": self.config.preset, "steps": trainer.step_count},
+            None if trainer.field.coarse is None else trainer.field.coarse.weights(),
         )
 
     # ---------------------------------- One step ----------------------------------

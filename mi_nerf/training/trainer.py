@@ -14,12 +14,14 @@ from ..data import Dataset
 from ..encoding import FourierEncoding
 from ..field import Corner, NeuralField, NeuralFieldConfig
 from ..occupancy import OccupancyGrid, grid_shape
-from ..quadrature import over_background
-from ..volume import Evaluation, MarchSettings, Samples, integrate, place_samples
-from .batches import RaySource, blank_loss, step_rng
+from ..quadrature import Composite, over_background
+from ..volume import Evaluation, MarchSettings, Samples, integrate, place_samples, refine
+from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
 from .losses import LOSSES, squared_error
-from .optimizer import Adam
+from .optimizer import Adam, JointParameters
+
+_COARSE_SEED = 500  # apart from the seeds of the fine network and of its restarts
 
 
 @dataclass
@@ -98,9 +100,16 @@ class Trainer:
         config = self.config
         seed = config.seed + 1000 * self.attempt
         self.field = NeuralField.create(self.field_config, seed, self._backend.TensorXf)
+        groups = {"": self.field.parameters()}
+        if config.sampling.fine:
+            self.field.coarse = NeuralField.create(
+                self.field_config, seed + _COARSE_SEED, self._backend.TensorXf
+            )
+            groups["coarse."] = self.field.coarse.parameters()
+        self.parameters = JointParameters(groups)
         options = config.optimizer
         self.optimizer = Adam(
-            self.field.parameters(),
+            self.parameters,
             beta1=options.beta1,
             beta2=options.beta2,
             epsilon=options.epsilon,
@@ -135,34 +144,65 @@ class Trainer:
             occupancy=self.occupancy,
             jitter=jitter,
         )
-        self._adapt_rays(samples)
-        complete = samples.truncate(config.sampling.batch)
-        loss, mse = self._differentiate(batch, samples, complete)
+        self.optimizer.zero_grad()
+        loss, mse, complete, queries = self._differentiate(batch, samples, rng)
         accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
         self.step_count += 1
         self._refresh_occupancy()
-        return StepResult(loss, mse, accepted, complete, samples.queries)
+        return StepResult(loss, mse, accepted, complete, queries)
 
-    def _differentiate(self, batch: Any, samples: Samples, complete: int) -> tuple[Any, Any]:
-        """Loss over the first ``complete`` rays; gradients end in the field's parameters."""
-        self.optimizer.zero_grad()
+    def _differentiate(
+        self, batch: RayBatch, samples: Samples, rng: Any
+    ) -> tuple[Any, Any, int, int]:
+        """Gradients of the loss over the rays that fit in the batch end in the parameters.
+
+        Returns:
+            Loss, squared error of the fine network, rays that counted, and queries made.
+        """
+        budget, fine = self.config.sampling.batch, self.config.sampling.fine
+        rays, wanted = samples.rays, samples.queries
+        complete = samples.truncate(budget)
+        queries, passes = samples.queries, []
+        if self.field.coarse is not None:
+            coarse = self._evaluate(self.field.coarse, samples)
+            passes.append((coarse, integrate(coarse, samples)))
+            jitter = rng.random(self._backend.Float, samples.rays * fine)
+            weights = passes[0][1].weights
+            refined = refine(samples, weights, fine, self.occupancy, jitter)
+            wanted += refined.queries
+            complete = min(complete, refined.truncate(max(1, budget - queries)))
+            queries += refined.queries
+            samples = refined
+        self._adapt_rays(rays, wanted)
+        evaluation = self._evaluate(self.field, samples)
+        passes.append((evaluation, integrate(evaluation, samples)))
+        errors = [self._errors(batch, seen, complete) for _, seen in passes]
+        loss = sum((e for e, _ in errors), self._backend.Float(0))  # NeRF Eq. 6: of both
+        dr.backward(loss)
+        loss, mse = dr.detach(loss), errors[-1][1]
+        dr.eval(loss, mse)
+        for evaluation, _ in passes:
+            evaluation.backward()
+        return loss, mse, complete, queries
+
+    def _evaluate(self, field: NeuralField, samples: Samples) -> Evaluation:
         evaluation = Evaluation(
-            self.field, samples, self.march_settings().block, keep=self._keep(samples)
+            field, samples, self.march_settings().block, keep=self._keep(samples)
         )
         evaluation.enable_grad()
-        seen = integrate(evaluation, samples)
+        return evaluation
+
+    def _errors(self, batch: RayBatch, seen: Composite, complete: int) -> tuple[Any, Any]:
+        """Loss and squared error of one network's image, means over the first rays."""
         predicted = over_background(seen.color, seen.opacity, batch.background)
         target = over_background(batch.color, batch.alpha, batch.background)
         float_type = self._backend.Float
-        index = dr.arange(self._backend.UInt32, samples.rays)
-        used = index < dr.opaque(self._backend.UInt32, complete)
+        used = dr.arange(self._backend.UInt32, len(seen.opacity)) < dr.opaque(
+            self._backend.UInt32, complete
+        )
         share = dr.opaque(float_type, 1 / max(complete, 1))
         loss = dr.sum(dr.select(used, self._loss(predicted, target), 0)) * share
         mse = dr.sum(dr.select(used, dr.detach(squared_error(predicted, target)), 0)) * share
-        dr.backward(loss)
-        loss = dr.detach(loss)
-        dr.eval(loss, mse)
-        evaluation.backward()
         return loss, mse
 
     def _carve(self, dataset: Dataset) -> np.ndarray[Any, Any]:
@@ -178,10 +218,10 @@ class Trainer:
             return self.config.sampling.rays
         return max(64, int(self.rays_per_step) // 64 * 64)
 
-    def _adapt_rays(self, samples: Samples) -> None:
+    def _adapt_rays(self, rays: int, queries: int) -> None:
         """Aims at a full batch: more rays as space turns out to be empty."""
         sampling = self.config.sampling
-        wanted = 0.95 * sampling.batch * samples.rays / max(samples.queries, 1)
+        wanted = 0.95 * sampling.batch * rays / max(queries, 1)
         wanted = min(max(wanted, 64.0), float(sampling.max_rays))
         self.rays_per_step += 0.1 * (wanted - self.rays_per_step)
 
@@ -191,6 +231,7 @@ class Trainer:
         units = config.position.size + config.direction.size + network.depth * network.width
         units += int(network.feature_layer) * network.width
         units += network.view_depth * network.view_width
+        units *= 2 if self.config.sampling.fine else 1  # both networks keep theirs
         return samples.queries * units * 4 < self.config.store_activations * 2**30
 
     def _refresh_occupancy(self) -> None:
