@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
+import drjit as dr
 import numpy as np
 
 from . import network
@@ -99,10 +100,40 @@ class NeuralFieldConfig:
         return max(b - a for a, b in zip(self.lower, self.upper, strict=True)) / 2
 
 
+@dataclass(frozen=True)
+class DensityNoise:
+    """Gaussian noise that follows from position and seed, so that it can be computed again."""
+
+    level: float  # standard deviation
+    seed: int
+
+    def at(self, p: Any) -> Any:
+        """One value for each of N positions in single precision (Box & Muller 1958)."""
+        float_type = type(p[0])
+        uint = dr.uint32_array_t(float_type)
+        key = dr.opaque(uint, self.seed & 0xFFFFFFFF)
+        for i in range(3):
+            key = _scramble(key ^ dr.reinterpret_array(uint, p[i]))
+        # From the upper 24 bits, never 0.
+        first, second = (
+            (float_type(k >> 8) + 0.5) * 2.0**-24 for k in (key, _scramble(key + 0x9E3779B9))
+        )
+        radius = dr.sqrt(-2 * dr.log(first))
+        return dr.opaque(float_type, self.level) * radius * dr.cos(2 * dr.pi * second)
+
+
+def _scramble(x: Any) -> Any:
+    """A hash of 32 bits (the output function of PCG, O'Neill 2014)."""
+    x = x * 747796405 + 2891336453
+    x = ((x >> ((x >> 28) + 4)) ^ x) * 277803737
+    return (x >> 22) ^ x
+
+
 class NeuralField:
     """Fourier features into an MLP (NeRF Sec. 4 and 5.1), behind the Field protocol."""
 
     coarse: NeuralField | None = None  # says where this one is worth sampling (Sec. 5.2)
+    noise: DensityNoise | None = None  # added to raw densities, in training
 
     def __init__(
         self,
@@ -142,7 +173,7 @@ class NeuralField:
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
-        return self._density(self._trunk(p))
+        return self._density(self._trunk(p), p)
 
     def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
         """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
@@ -150,7 +181,7 @@ class NeuralField:
         h = self._trunk(p)
         direction = config.direction(d) if config.network.view_dependent else None
         raw = network.color_head(config.network, self._weights, h, direction)
-        return self._density(h), [apply_activation(config.color_activation, c) for c in raw]
+        return self._density(h, p), [apply_activation(config.color_activation, c) for c in raw]
 
     def _trunk(self, p: Any) -> Any:
         config = self.config
@@ -159,7 +190,9 @@ class NeuralField:
         )
         return network.trunk(config.network, self._weights, config.position(unit))
 
-    def _density(self, h: Any) -> Any:
+    def _density(self, h: Any, p: Any) -> Any:
         config = self.config
         raw = network.density_head(self._weights, h) + config.density_shift
+        if self.noise is not None:
+            raw = raw + self.noise.at(p)
         return apply_activation(config.density_activation, raw) * config.density_scale

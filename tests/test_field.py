@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
 import drjit as dr
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from mi_nerf.encoding import FourierEncoding
-from mi_nerf.field import Field, NeuralField, NeuralFieldConfig
+from mi_nerf.field import DensityNoise, Field, NeuralField, NeuralFieldConfig
 from mi_nerf.network import NetworkConfig, initial_weights
 from tests.arrays import unit, vectors
 
@@ -228,3 +229,35 @@ def test_wrong_weights_are_refused(ad: Any) -> None:
 def test_settings_are_validated(change: dict[str, Any], named: str) -> None:
     with pytest.raises(ValueError, match=named):
         dataclasses.replace(SMALL, **change)
+
+
+# --------------------------------------------------------------------------
+#   Noise on raw densities
+# --------------------------------------------------------------------------
+
+
+def test_density_noise_is_standard_normal(ad: Any) -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (3, 200_000)).astype(np.float32)
+    noise = np.array(DensityNoise(2.0, 7).at(ad.Array3f(points)))
+    assert noise.mean() == pytest.approx(0, abs=0.02)
+    assert noise.std() == pytest.approx(2, rel=0.01)
+    for bound in (-1, 0, 1, 2):  # the normal distribution function
+        expected = 0.5 * (1 + math.erf(bound / math.sqrt(2)))
+        assert (noise < 2 * bound).mean() == pytest.approx(expected, abs=5e-3)
+    # Neighbours, seeds and repeats.
+    close = np.array(DensityNoise(2.0, 7).at(ad.Array3f(points + np.float32(1e-6))))
+    other = np.array(DensityNoise(2.0, 8).at(ad.Array3f(points)))
+    again = np.array(DensityNoise(2.0, 7).at(ad.Array3f(points)))
+    assert abs(np.corrcoef(noise, close)[0, 1]) < 0.02
+    assert abs(np.corrcoef(noise, other)[0, 1]) < 0.02
+    assert (again == noise).all()
+
+
+def test_density_noise_acts_before_the_activation(ad: Any) -> None:
+    config = NeuralFieldConfig(network=NetworkConfig(depth=1, width=8, skip=-1, view_width=8))
+    field = NeuralField.create(config, 0, ad.TensorXf)
+    p = ad.Array3f(np.random.default_rng(0).uniform(-1, 1, (3, 50)).astype(np.float32))
+    clean = np.array(field.density(p), np.float64)
+    field.noise = DensityNoise(1.0, 3)
+    raw = np.log(np.expm1(clean)) + np.array(field.noise.at(p), np.float64)
+    assert np.array(field.density(p)) == pytest.approx(np.log1p(np.exp(raw)), rel=1e-4)

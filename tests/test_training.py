@@ -17,6 +17,7 @@ import drjit.llvm.ad as ad
 import numpy as np
 import pytest
 
+from mi_nerf.cameras import project
 from mi_nerf.data import Dataset, load_dataset
 from mi_nerf.errors import InputError
 from mi_nerf.field import NeuralFieldConfig
@@ -459,3 +460,53 @@ def test_the_paper_trains_two_published_networks() -> None:
         network=config.network, position=config.position, direction=config.direction
     )
     assert field.parameter_count() == 595_844
+
+
+# --------------------------------------------------------------------------
+#   The paper's settings for the first steps, and for real captures
+# --------------------------------------------------------------------------
+
+
+def test_cropped_rays_pass_the_middle(views: Dataset) -> None:
+    """Only pixels 5 to 14 of 20, in both directions, with their own colours."""
+    source = Trainer(small(), views, ad)._source
+    for crop, low, high in ((0.5, 5, 15), (1.0, 0, 20)):
+        batch = source.draw(4096, step_rng(ad.Float, 0, 0), crop)
+        o, d = (np.array(v, np.float64).T for v in (batch.o, batch.d))
+        camera = np.argmin(np.linalg.norm(o[:, None] - views.cam_to_world[:, :3, 3], axis=-1), 1)
+        xy = np.stack(
+            [
+                project(o[i] + d[i], views.intrinsics, views.cam_to_world[camera[i]])[0]
+                for i in range(len(o))
+            ]
+        )
+        pixel = np.floor(xy).astype(int)
+        assert np.abs(xy - pixel - 0.5).max() < 1e-3
+        assert (pixel.min(), pixel.max()) == (low, high - 1)
+        assert len(np.unique(camera)) == len(views)
+        expected = views.images[camera, pixel[:, 1], pixel[:, 0]]
+        found = np.stack([np.array(c) for c in (*batch.color, batch.alpha)], axis=1)
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_noise_is_for_captures_and_training_alone(views: Dataset) -> None:
+    opaque = replace(views, has_alpha=False)
+    losses = {}
+    for name, data in (("synthetic", views), ("capture", opaque)):
+        for level in (0.0, 1.0):
+            config = small("background=white", "occupancy.hull=False", f"density.noise={level}")
+            trainer = Trainer(config, data, ad)
+            losses[name, level] = float(trainer.step(1e-3).loss[0])
+            assert trainer.field.noise is None
+    assert losses["synthetic", 0.0] == losses["synthetic", 1.0] == losses["capture", 0.0]
+    assert losses["capture", 1.0] != losses["capture", 0.0]
+
+
+def test_noisy_steps_do_not_depend_on_what_is_kept(views: Dataset) -> None:
+    """The backward pass that computes activations again meets the same noise."""
+    opaque = replace(views, has_alpha=False)
+    config = small("density.noise=1.0", "occupancy.hull=False")
+    kept = weights_after(Trainer(config, opaque, ad), 3)
+    recomputed = weights_after(Trainer(replace(config, store_activations=0.0), opaque, ad), 3)
+    for name, expected in kept.items():
+        np.testing.assert_allclose(recomputed[name], expected, atol=1e-5)

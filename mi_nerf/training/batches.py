@@ -33,17 +33,24 @@ class RaySource:
         self._pixels = float_type(dataset.images.reshape(-1))
         self._poses = float_type(pack_poses(dataset.cam_to_world))
         self._background = background
-        self._size = self._intrinsics.width * self._intrinsics.height
-        self._count = len(dataset) * self._size
+        self._views = len(dataset)
 
-    def draw(self, rays: int, rng: Any) -> RayBatch:
-        """``rays`` pixels chosen uniformly over all images, through their centres."""
-        pixel = rng.integers(self._uint, rays, high=dr.opaque(self._uint, self._count))
-        camera = pixel // dr.opaque(self._uint, self._size)
-        within = pixel - camera * dr.opaque(self._uint, self._size)
-        width = dr.opaque(self._uint, self._intrinsics.width)
+    def draw(self, rays: int, rng: Any, crop: float = 1.0) -> RayBatch:
+        """``rays`` pixels chosen uniformly over all images, through their centres.
+
+        ``crop`` leaves only the middle of the images, that share of their width and height.
+        """
+        full, uint = self._intrinsics, self._uint
+        columns, rows = (max(1, round(crop * n)) for n in (full.width, full.height))
+        width, area = dr.opaque(uint, columns), dr.opaque(uint, columns * rows)
+        chosen = rng.integers(uint, rays, high=dr.opaque(uint, self._views * columns * rows))
+        camera = chosen // area
+        within = chosen - camera * area
         row = within // width
-        x, y = self._float(within - row * width) + 0.5, self._float(row) + 0.5
+        column = within - row * width + dr.opaque(uint, (full.width - columns) // 2)
+        row = row + dr.opaque(uint, (full.height - rows) // 2)
+        x, y = self._float(column) + 0.5, self._float(row) + 0.5
+        pixel = (camera * dr.opaque(uint, full.height) + row) * dr.opaque(uint, full.width) + column
         o, d = pixel_rays(self._poses, self._intrinsics, camera, x, y)
         rgba = [dr.gather(self._float, self._pixels, pixel * 4 + i) for i in range(4)]
         batch = RayBatch(o, d, rgba[:3], rgba[3], self._draw_background(rays, rng))

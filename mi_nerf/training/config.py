@@ -22,9 +22,11 @@ class DensityConfig:
     activation: DensityActivation = "softplus"
     shift: float = -1.0  # added before the activation (softplus(x − 1): mip-NeRF)
     gain: float = 1.0  # density of activation output 1, per half side of the box
+    noise: float = 0.0  # of N(0, 1) added to raw densities in training; images without alpha only
 
     def __post_init__(self) -> None:
         require(self, "gain", above=0)
+        require(self, "noise", at_least=0)
 
 
 @dataclass(frozen=True)
@@ -114,6 +116,8 @@ class TrainConfig:
     checkpoint_every: float = 60.0  # seconds between checkpoints
     collapse_check: int = 400  # steps after which a run that learnt nothing restarts
     max_restarts: int = 3
+    crop_steps: int = 0  # so many first steps see only the middle of the images,
+    crop: float = 0.5  # this share of their width and height
     max_skipped: int = 20  # non-finite steps in a row that end the run
     store_activations: float = 6.0  # GiB of activations kept for the backward pass
 
@@ -121,7 +125,8 @@ class TrainConfig:
         require(self, "seed", at_least=0, below=1 << 31)
         require(self, "steps downscale max_skipped", at_least=1)
         require(self, "max_seconds", above=0)
-        require(self, "report_every checkpoint_every", at_least=0)
+        require(self, "report_every checkpoint_every crop_steps", at_least=0)
+        require(self, "crop", above=0, at_most=1)
         require(self, "collapse_check max_restarts store_activations", at_least=0)
         box = self.box or (0, 0, 0, 1, 1, 1)
         if not all(box[i] < box[i + 3] for i in range(3)):

@@ -32,7 +32,7 @@ def paper() -> TrainConfig:
         preset="paper",
         background="white",
         position=FourierEncoding(frequencies=10),
-        density=DensityConfig(activation="relu", shift=0.0),
+        density=DensityConfig(activation="relu", shift=0.0, noise=1.0),
         occupancy=OccupancyConfig(enabled=False, hull=False),
         sampling=SamplingConfig(samples=64, fine=128, render_samples=64, rays=4096, batch=1 << 21),
         optimizer=OptimizerConfig(warmup=0, beta2=0.999, epsilon=1e-7),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +14,7 @@ import numpy as np
 from .. import hull
 from ..data import Dataset
 from ..encoding import FourierEncoding
-from ..field import Corner, NeuralField, NeuralFieldConfig
+from ..field import Corner, DensityNoise, NeuralField, NeuralFieldConfig
 from ..occupancy import OccupancyGrid, grid_shape
 from ..quadrature import Composite, over_background
 from ..volume import Evaluation, MarchSettings, Samples, integrate, place_samples, refine
@@ -84,6 +86,7 @@ class Trainer:
         background = config.background
         if background == "auto":
             background = "random" if dataset.has_alpha else "white"
+        self._noise_level = 0.0 if dataset.has_alpha else config.density.noise
         self._source = RaySource(dataset, background, backend.Float)
         self.blank_loss = blank_loss(dataset, background)
         loss = config.loss
@@ -134,7 +137,8 @@ class Trainer:
         config = self.config
         rng = step_rng(self._backend.Float, config.seed, self.step_count)
         rays = self._ray_count()
-        batch = self._source.draw(rays, rng)
+        crop = config.crop if self.step_count < config.crop_steps else 1.0
+        batch = self._source.draw(rays, rng, crop)
         jitter = rng.random(self._backend.Float, rays * config.sampling.samples)
         samples = place_samples(
             self.field,
@@ -145,11 +149,25 @@ class Trainer:
             jitter=jitter,
         )
         self.optimizer.zero_grad()
-        loss, mse, complete, queries = self._differentiate(batch, samples, rng)
+        with self._noise():
+            loss, mse, complete, queries = self._differentiate(batch, samples, rng)
         accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
         self.step_count += 1
         self._refresh_occupancy()
         return StepResult(loss, mse, accepted, complete, queries)
+
+    @contextmanager
+    def _noise(self) -> Iterator[None]:
+        """Regularises the densities of real captures (NeRF, appendix A)."""
+        networks = [f for f in (self.field, self.field.coarse) if f is not None]
+        for k, network in enumerate(networks):
+            if self._noise_level > 0:
+                network.noise = DensityNoise(self._noise_level, 2 * self.step_count + k)
+        try:
+            yield
+        finally:
+            for network in networks:
+                network.noise = None
 
     def _differentiate(
         self, batch: RayBatch, samples: Samples, rng: Any
