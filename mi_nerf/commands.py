@@ -13,6 +13,7 @@ from tqdm.auto import tqdm
 from tyro.conf import Positional, UseAppendAction, arg, subcommand
 
 from . import info
+from .ablation import ROWS, ablate, table
 from .backend import choose_variant
 from .demo import run_demo
 from .errors import InputError
@@ -173,6 +174,70 @@ class Train:
                 f"{self.out}: a resumed run keeps its settings, expected no other --preset, "
                 "--seed, --downscale or --set than it was started with"
             )
+
+
+@dataclass(frozen=True)
+class Ablate:
+    """Measures what each part of the model is worth (NeRF, Table 2), on one dataset.
+
+    Calling it again goes on where it was interrupted, or adds seeds and rows.
+
+    Examples:
+
+    mi-nerf ablate lego/ --out ablation/ --downscale 2 --max-seconds 300 --seeds 3
+
+    mi-nerf ablate lego/ --out quick/ --rows no-pe no-vd complete --downscale 4 --steps 2000
+    """
+
+    data: Positional[Annotated[Path, arg(metavar="DATA")]]
+    """Folder of a dataset."""
+    out: Path
+    """Folder of the runs, the table (ablation.md, ablation.json) and the figure."""
+    rows: tuple[str, ...] = tuple(ROWS)
+    """Which rows of the table."""
+    seeds: int = 1
+    """Runs of each row, with seeds from 0."""
+    preset: str = "nerf"
+    """Scale of the model: nerf, or paper for the published one."""
+    max_seconds: float | None = None
+    """Training time of each run (default 300 if --steps is not given)."""
+    steps: int | None = None
+    """Training steps of each run."""
+    downscale: int = 1
+    """Average images over blocks of K×K pixels."""
+    split: str = "test"
+    """Views to evaluate on."""
+    views: int | None = None
+    """Only so many of them, evenly spread."""
+    set: UseAppendAction[tuple[str, ...]] = ()
+    """Change any setting of all rows: key=value; repeatable."""
+    variant: Variant = None
+
+    def run(self, _started: float) -> None:
+        """Trains and evaluates all rows."""
+        config = with_settings(preset(self.preset), list(self.set))
+        config = replace(config, downscale=_positive("downscale", self.downscale))
+        if self.steps is None:
+            seconds = 300.0 if self.max_seconds is None else self.max_seconds
+            config = replace(config, max_seconds=_positive("max-seconds", seconds))
+        else:
+            config = replace(config, steps=_positive("steps", self.steps))
+        if self.views is not None:
+            _positive("views", self.views)
+        record = ablate(
+            self.data,
+            self.out,
+            config,
+            choose_variant(self.variant),
+            rows=self.rows,
+            seeds=_positive("seeds", self.seeds),
+            split=self.split,
+            views=self.views,
+        )
+        print(table(record))
+        if not record["complete"]:
+            print(f"{self.out}: interrupted, the same command goes on")
+            raise KeyboardInterrupt
 
 
 @dataclass(frozen=True)
@@ -363,6 +428,7 @@ COMMANDS = {
     "demo": Demo,
     "generate": Generate,
     "train": Train,
+    "ablate": Ablate,
     "eval": Eval,
     "render": Render,
     "info": Info,

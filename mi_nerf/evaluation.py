@@ -94,7 +94,7 @@ def evaluate(
         "seconds_per_view": float(np.median(seconds)),
         "queries_per_ray": queries / (len(dataset) * size.width * size.height),
         "train_seconds": target.train_seconds,
-        "parameters": target.contents.config.parameter_count(),
+        "parameters": target.contents.parameter_count(),
     }
 
 

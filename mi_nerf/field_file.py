@@ -31,6 +31,10 @@ class FieldFile:
     provenance: dict[str, Any] = field(default_factory=dict)  # free-form, for people
     coarse: Arrays | None = None  # weights of the coarse network, of the same architecture
 
+    def parameter_count(self) -> int:
+        """Number of trainable scalars, of both networks if there are two."""
+        return self.config.parameter_count() * (1 if self.coarse is None else 2)
+
     def build(self, backend: Any) -> tuple[NeuralField, OccupancyGrid | None]:
         """Uploads the field to a backend (``drjit.llvm.ad``, or ``mitsuba`` with a variant)."""
         neural = NeuralField(self.config, self.weights, backend.TensorXf)

@@ -110,6 +110,7 @@ def test_all_names_can_be_assigned() -> None:
         "sampling.near": "1",
         "sampling.far": "9",
         "sampling.render_fine": "7",
+        "views": "5",
     }
     config = with_settings(TrainConfig(), ["position.frequencies=10"])
     for name in names:

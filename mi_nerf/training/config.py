@@ -101,6 +101,7 @@ class TrainConfig:
     steps: int | None = None  # stop after so many steps
     max_seconds: float | None = None  # stop after so much wall-clock time
     downscale: int = 1  # images are averaged over blocks of K×K pixels
+    views: int | None = None  # train on so many views, evenly spread; none: all
     box: tuple[float, float, float, float, float, float] | None = None  # min, max; none: found
     background: Literal["auto", "white", "black", "random"] = "auto"
     loss: Literal["auto", "mse", "relative"] = "auto"
@@ -123,7 +124,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require(self, "seed", at_least=0, below=1 << 31)
-        require(self, "steps downscale max_skipped", at_least=1)
+        require(self, "steps downscale views max_skipped", at_least=1)
         require(self, "max_seconds", above=0)
         require(self, "report_every checkpoint_every crop_steps", at_least=0)
         require(self, "crop", above=0, at_most=1)

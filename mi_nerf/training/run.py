@@ -249,7 +249,7 @@ def start(
     elif (folder / CONFIG).exists() or (folder / CHECKPOINT).exists():
         raise InputError(f"{folder}: already holds a run, expected --resume or another folder")
     check_folder(folder)
-    dataset = load_dataset(data, "train", downscale=config.downscale)
+    dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
     run = Run(folder, config, dataset, variant, started=started)
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
