@@ -22,6 +22,7 @@ from .files import check_file, check_folder, make_folder, write_json
 from .generation import Options, generate
 from .generation.run import summary
 from .rendering import check_output, output_kind, run_frames, scene_frames, write_frames
+from .report import report
 from .scene_library import find_scene
 from .target import open_target
 from .training import run as training
@@ -377,6 +378,36 @@ class Render:
 
 
 @dataclass(frozen=True)
+class Report:
+    """Draws what a field has learnt: so far, the colour of points over all directions.
+
+    Examples:
+
+    mi-nerf report runs/lego --out report/
+
+    mi-nerf report lego.safetensors --out report/ --point 0.1 -0.3 0.2 --point 0 0 0.4
+    """
+
+    target: Positional[Annotated[Path, arg(metavar="TARGET")]]
+    """A run folder, or a field file (then with --point)."""
+    out: Path
+    """Folder for report.md, report.json and the plots."""
+    point: UseAppendAction[tuple[tuple[float, float, float], ...]] = ()
+    """A point whose emission is drawn; repeatable. Default: three that the cameras see."""
+    variant: Variant = None
+
+    def run(self, _started: float) -> None:
+        """Reports."""
+        record = report(
+            open_target(self.target), self.out, choose_variant(self.variant), self.point
+        )
+        for entry in record["view_dependence"]:
+            where = ", ".join(f"{v:.3f}" for v in entry["point"])
+            print(f"({where}): deviation over directions {entry['deviation']:.3f}")
+        print(f"{self.out / 'report.md'}")
+
+
+@dataclass(frozen=True)
 class Info:
     """Says what this machine offers, or what a run, checkpoint, field or dataset holds.
 
@@ -431,6 +462,7 @@ COMMANDS = {
     "ablate": Ablate,
     "eval": Eval,
     "render": Render,
+    "report": Report,
     "info": Info,
 }
 

@@ -1,0 +1,117 @@
+"""Reports: the emission of points over the hemisphere of directions."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+import imageio.v3 as iio
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mi_nerf.backend import array_module, choose_variant
+from mi_nerf.cameras import Intrinsics
+from mi_nerf.cli import main
+from mi_nerf.errors import InputError
+from mi_nerf.report.view_dependence import (
+    draw_view_dependence,
+    emission_over_hemisphere,
+    find_points,
+    surface_normal,
+)
+from mi_nerf.volume import MarchSettings
+from tests.analytic import AnalyticField, ball, gaussian
+from tests.arrays import unit
+from tests.datasets import orbit_poses
+
+VARIANT = choose_variant()
+BACKEND = array_module(VARIANT)
+
+directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+@given(directions)
+def test_the_disc_is_the_hemisphere_from_above(direction: Any) -> None:
+    """A field that emits half of one plus the direction in which light travels."""
+    normal = unit(np.array([direction]))[0]
+    field = AnalyticField(
+        gaussian((0, 0, 0), 0.3, 5.0), lambda p, d: [0.5 - 0.5 * d[i] for i in range(3)]
+    )
+    size = 33
+    image = emission_over_hemisphere(field, (0.1, 0.2, 0), normal, BACKEND, size)
+    assert image.shape == (size, size, 4)
+    y, x = (np.mgrid[:size, :size] + 0.5) / size * 2 - 1
+    inside = x**2 + y**2 < 1
+    assert (image[..., 3] == inside).all() and (image[~inside] == 0).all()
+    towards = 2 * image[..., :3] - 1  # rays travel the other way
+    assert np.linalg.norm(towards[inside], axis=-1) == pytest.approx(1, abs=1e-5)
+    expected = np.sqrt(1 - x**2 - y**2, where=inside, out=np.zeros_like(x))
+    assert (towards @ normal)[inside] == pytest.approx(expected[inside], abs=1e-5)
+    assert towards[size // 2, size // 2] == pytest.approx(normal, abs=1e-5)
+    # Right-handed, seen from above: a step right and a step up span the normal.
+    right = towards[size // 2, size // 2 + 2] - towards[size // 2, size // 2]
+    up = towards[size // 2 - 2, size // 2] - towards[size // 2, size // 2]
+    assert np.cross(right, up) @ normal > 0
+
+
+@given(directions)
+def test_normals_point_out_of_a_blob(direction: Any) -> None:
+    out = unit(np.array([direction]))[0]
+    field = AnalyticField(gaussian((0.1, 0, -0.1), 0.3, 5.0))
+    point = np.array([0.1, 0, -0.1]) + 0.3 * out
+    assert surface_normal(field, point, BACKEND) == pytest.approx(out, abs=1e-2)
+
+
+def test_even_density_has_no_normal() -> None:
+    field = AnalyticField(lambda p: dr.zeros(type(p[0]), len(p[0])))
+    with pytest.raises(InputError, match="no surface there"):
+        surface_normal(field, (0, 0, 0), BACKEND)
+
+
+def test_points_lie_on_what_cameras_see() -> None:
+    field = AnalyticField(ball(0.5, 1000.0))
+    camera = Intrinsics.from_angle_x(32, 32, 0.5)
+    march = MarchSettings(samples=512)
+    points = find_points(field, None, camera, orbit_poses(6), march, BACKEND, count=4)
+    assert np.linalg.norm(points, axis=1) == pytest.approx(0.5, abs=0.01)
+    apart = np.linalg.norm(points[:, None] - points, axis=-1) + 9 * np.eye(4)
+    assert apart.min() > 0.4
+    empty = AnalyticField(ball(0.5, 0.0))
+    with pytest.raises(InputError, match="expected --point"):
+        find_points(empty, None, camera, orbit_poses(6), march, BACKEND)
+
+
+def test_deviation_measures_view_dependence(tmp_path: Path) -> None:
+    dull = AnalyticField(gaussian((0, 0, 0), 0.3, 5.0))
+    shiny = AnalyticField(
+        gaussian((0, 0, 0), 0.3, 5.0), lambda p, d: [dr.square(d[2]) for _ in range(3)]
+    )
+    point = np.array([[0.2, 0.1, 0.2]])
+    found = [draw_view_dependence(tmp_path / "a.png", f, point, VARIANT) for f in (dull, shiny)]
+    assert found[0][0]["deviation"] == pytest.approx(0, abs=1e-6)
+    assert found[1][0]["deviation"] > 0.05
+    assert iio.imread(tmp_path / "a.png").ndim == 3
+
+
+def test_the_command(blob_run: Path, tmp_path: Path) -> None:
+    points = ["--point", "0.1", "0.2", "0.3", "--point", "-0.2", "0", "0.1"]
+    assert main(["report", str(blob_run), "--out", str(tmp_path / "out"), *points]) == 0
+    record = json.loads((tmp_path / "out/report.json").read_text())
+    found = [entry["point"] for entry in record["view_dependence"]]
+    assert found == [[0.1, 0.2, 0.3], [-0.2, 0, 0.1]]
+    text = (tmp_path / "out/report.md").read_text()
+    assert "| 0.10, 0.20, 0.30 |" in text and "(view_dependence.png)" in text
+    assert (tmp_path / "out/view_dependence.png").exists()
+
+
+def test_bad_input(refused: Callable[..., str], run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    line = refused("report", run, "--out", out, "--point", "9", "0", "0")
+    assert "--point 9.0 0.0 0.0: outside the field's box" in line
+    line = refused("report", run / "field.safetensors", "--out", out)
+    assert "expected --point" in line
