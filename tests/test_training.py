@@ -510,3 +510,8 @@ def test_noisy_steps_do_not_depend_on_what_is_kept(views: Dataset) -> None:
     recomputed = weights_after(Trainer(replace(config, store_activations=0.0), opaque, ad), 3)
     for name, expected in kept.items():
         np.testing.assert_allclose(recomputed[name], expected, atol=1e-5)
+
+
+def test_more_samples_than_memory_are_refused(views: Dataset) -> None:
+    with pytest.raises(InputError, match="one step would need .* GiB for its samples, expected"):
+        Trainer(small("sampling.fine=1000000000"), views, ad)

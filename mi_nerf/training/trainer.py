@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ import numpy as np
 from .. import hull
 from ..data import Dataset
 from ..encoding import FourierEncoding
+from ..errors import InputError
 from ..field import Corner, DensityNoise, NeuralField, NeuralFieldConfig
 from ..occupancy import OccupancyGrid, grid_shape
 from ..quadrature import Composite, over_background
@@ -23,6 +25,8 @@ from .config import TrainConfig
 from .losses import LOSSES, squared_error
 from .optimizer import Adam, JointParameters
 
+_FEWEST_RAYS = 64  # in a step
+_BYTES_PER_SAMPLE = 100  # parameter, width, density, colour, weight, and their adjoints
 _COARSE_SEED = 500  # apart from the seeds of the fine network and of its restarts
 
 
@@ -75,6 +79,19 @@ def resolved_octaves(dataset: Dataset, lower: Corner, upper: Corner) -> int:
     return int(np.clip(round(math.log2(max(pixels, 2.0))), 1, 12))
 
 
+def _require_memory(config: TrainConfig) -> None:
+    """Refuses steps whose samples alone would not fit in memory."""
+    sampling = config.sampling
+    samples = (sampling.rays or _FEWEST_RAYS) * (2 * sampling.samples + sampling.fine)
+    needed = samples * _BYTES_PER_SAMPLE
+    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if needed > there:
+        raise InputError(
+            f"sampling.samples={sampling.samples}, fine={sampling.fine}: one step would need "
+            f"{needed / 2**30:.0f} GiB for its samples, expected less than {there / 2**30:.0f} GiB"
+        )
+
+
 class Trainer:
     """Holds a field, its optimiser and its occupancy, and improves them step by step."""
 
@@ -86,6 +103,7 @@ class Trainer:
         background = config.background
         if background == "auto":
             background = "random" if dataset.has_alpha else "white"
+        _require_memory(config)
         self._noise_level = 0.0 if dataset.has_alpha else config.density.noise
         self._source = RaySource(dataset, background, backend.Float)
         self.blank_loss = blank_loss(dataset, background)
@@ -234,7 +252,7 @@ class Trainer:
         """Rays of the next step, in steps of 64 so that arrays are seldom resized."""
         if self.config.sampling.rays is not None:
             return self.config.sampling.rays
-        return max(64, int(self.rays_per_step) // 64 * 64)
+        return max(_FEWEST_RAYS, int(self.rays_per_step) // 64 * 64)
 
     def _adapt_rays(self, rays: int, queries: int) -> None:
         """Aims at a full batch: more rays as space turns out to be empty."""
