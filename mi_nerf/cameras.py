@@ -43,6 +43,10 @@ _FLIP_YZ = np.array([1.0, -1.0, -1.0, 1.0])
 _FLIP_XZ = np.array([-1.0, 1.0, -1.0, 1.0])
 _FLIP_XY = np.array([-1.0, -1.0, 1.0, 1.0])
 
+# How far the columns of a rotation may be from orthonormal. Files written from
+# float32 are within 1e-6; matrices that hold a scale or a shear are far outside.
+_RIGID_TOLERANCE = 1e-3
+
 
 def opengl_from_opencv(c2w: ArrayLike) -> NDArray[np.float64]:
     """OpenCV camera-to-world matrices (..., 4, 4) in OpenGL's axes."""
@@ -79,6 +83,21 @@ def _flip(c2w: ArrayLike, signs: NDArray[np.float64]) -> NDArray[np.float64]:
     if matrices.shape[-2:] != (4, 4):
         raise ValueError(f"expected poses of shape (..., 4, 4), got {matrices.shape}")
     return np.multiply(matrices, signs)
+
+
+def is_rigid(c2w: ArrayLike) -> bool:
+    """Whether a matrix, (4, 4), is a rotation and a translation, up to rounding.
+
+    Scale, shear, mirroring, NaN and infinity make it something else.
+    """
+    matrix = np.asarray(c2w, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        return False
+    rotation, bottom = matrix[:3, :3], matrix[3]
+    deviation = max(
+        np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(bottom - [0, 0, 0, 1]).max()
+    )
+    return bool(deviation <= _RIGID_TOLERANCE and np.linalg.det(rotation) > 0)
 
 
 def look_at(
