@@ -1,7 +1,7 @@
 """Renders rays through a field: the one path that training, evaluation and plugins share.
 
-    rays → interval in the box → strata → (cells that may hold something)
-         → field, in blocks of constant size → quadrature
+    rays → (normalised device coordinates) → interval in the box → strata
+         → (cells that may hold something) → field, in blocks of constant size → quadrature
 
 The field sees its queries in blocks of a constant number of columns, so tensor-mode
 kernels are compiled once whatever the number of samples a ray batch needs. The
@@ -12,13 +12,14 @@ block, which is what bounds the memory of a gradient.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from .arrays import gather_vector3
 from .field import Field
+from .ndc import NdcRays
 from .occupancy import OccupancyGrid
 from .quadrature import Composite, composite
 from .sampling import box_interval, clip_interval, points_along, stratified
@@ -46,12 +47,14 @@ class MarchSettings:
 class Samples:
     """R·S samples of R rays, and which of them the field has to be asked about."""
 
-    o: Any  # R origins
-    d: Any  # R unit directions
+    o: Any  # R origins, in the space where the field lives
+    d: Any  # R unit directions in that space
+    view: Any  # R unit directions in scene space, along which the field emits
     t: Any  # R·S sample parameters
     delta: Any  # R·S interval lengths
     count: int  # S
     index: Any  # the M samples to evaluate, ascending
+    ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
 
     @property
     def rays(self) -> int:
@@ -89,14 +92,21 @@ def place_samples(
     """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
 
     ``jitter`` is passed on to :func:`mi_nerf.sampling.stratified`; ``bounds`` limits t
-    ray by ray, besides what ``settings`` say. Sample positions carry no gradient.
+    ray by ray, besides what ``settings`` say. Sample positions carry no gradient. Rays
+    are projected first where the field asks for it: samples are then evenly spread in
+    t' (NeRF, appendix C), and rays that do not face forward see nothing.
     """
+    view, ndc = d, None
+    limits = [(settings.near, settings.far), bounds or (None, None)]
     with dr.suspend_grad():
-        near, far, hit = clip_interval(
-            *box_interval(o, d, field.lower, field.upper), settings.near, settings.far
-        )
-        if bounds is not None:
-            near, far, hit = clip_interval(near, far, hit, *bounds)
+        if field.ndc is not None:
+            ndc = field.ndc.rays(o, d)
+            o, d, limits = ndc.o, ndc.d, [ndc.bounds(*limit) for limit in limits]
+        near, far, hit = box_interval(o, d, field.lower, field.upper)
+        if ndc is not None:
+            hit &= ndc.facing
+        for limit in limits:
+            near, far, hit = clip_interval(near, far, hit, *limit)
         t, delta = stratified(near, far, settings.samples, jitter)
         dr.eval(t, delta)
         uint = dr.uint32_array_t(type(t))
@@ -105,7 +115,7 @@ def place_samples(
         if occupancy is not None:
             wanted &= occupancy.occupied(points_along(o, d, t, ray))
         index = uint(dr.compress(wanted))
-    return Samples(o, d, t, delta, settings.samples, index)
+    return Samples(o, d, view, t, delta, settings.samples, index, ndc)
 
 
 class Evaluation:
@@ -194,15 +204,23 @@ class Evaluation:
         ray = where // samples.count
         t = dr.gather(type(samples.t), samples.t, where)
         p = points_along(samples.o, samples.d, t, ray)
-        density, emission = self._field.density_emission(p, gather_vector3(samples.d, ray))
+        density, emission = self._field.density_emission(p, gather_vector3(samples.view, ray))
         return [density, *emission]
 
 
 def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
-    """Quadrature of an evaluated batch; differentiable in density and emission."""
-    return composite(
+    """Quadrature of an evaluated batch; differentiable in density and emission.
+
+    Depth is a distance in scene space: in normalised device coordinates, that of the
+    mean t'.
+    """
+    seen = composite(
         evaluation.density, evaluation.emission, samples.t, samples.delta, samples.count
     )
+    if samples.ndc is None:
+        return seen
+    distance = samples.ndc.to_distance(seen.depth)
+    return replace(seen, depth=dr.select(seen.opacity > 0, distance, 0))
 
 
 @dataclass
