@@ -137,6 +137,22 @@ def look_at(
     return c2w
 
 
+def average_pose(c2w: ArrayLike) -> NDArray[np.float64]:
+    """The camera in the middle of others: mean position, mean backward and upward axes.
+
+    Args:
+        c2w: OpenGL camera-to-world matrices, (N, 4, 4).
+
+    Returns:
+        The matrix, (4, 4).
+
+    Raises:
+        InputError: The axes cancel or are parallel.
+    """
+    _, up, back, position = (np.asarray(c2w, np.float64)[:, :3, i].mean(axis=0) for i in range(4))
+    return look_at(position, position - back, up)
+
+
 # --------------------------------------------------------------------------
 #   Intrinsics
 # --------------------------------------------------------------------------

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mi_nerf.cameras import Intrinsics, project
+from mi_nerf.cameras import Intrinsics, average_pose, project
 from mi_nerf.data import available_splits, load_dataset
-from mi_nerf.data.llff import average_pose
 from mi_nerf.errors import InputError
 from mi_nerf.generation.llff import poses_bounds
 from tests.datasets import (

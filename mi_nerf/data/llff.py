@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Intrinsics, is_rigid, look_at
+from ..cameras import Intrinsics, average_pose, is_rigid
 from ..errors import InputError
 from ..ndc import Ndc
 from .dataset import Box, Dataset, evenly_spread_indices
@@ -92,19 +92,6 @@ def load(
         box=_seen_box(ndc, *rays),
         ndc=ndc,
     )
-
-
-def average_pose(cam_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The camera in the middle of others: mean position, mean backward and upward axes.
-
-    Args:
-        cam_to_world: OpenGL poses, (N, 4, 4).
-
-    Raises:
-        InputError: The axes cancel or are parallel.
-    """
-    _, up, back, position = (cam_to_world[:, :3, i].mean(axis=0) for i in range(4))
-    return look_at(position, position - back, up)
 
 
 # ---- The array ---------------------------------------------------------------
