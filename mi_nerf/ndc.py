@@ -55,7 +55,7 @@ class Ndc:
         )
 
     def rays(self, o: Any, d: Any) -> NdcRays:
-        """Rays in normalised device coordinates (appendix C, Eqs. 25 and 26).
+        """Rays in normalised device coordinates (NeRF, appendix C).
 
         Origins are moved to the near plane first, as the appendix advises.
 
@@ -72,7 +72,7 @@ class Ndc:
         t = -(near + o[2]) / slope
         x, y, z = dr.fma(t, d[0], o[0]), dr.fma(t, d[1], o[1]), -near
 
-        # ---- Eq. 25 and Eq. 26 ----
+        # ---- o' and d' as the appendix has them ----
         vector3 = vector3_type(float_type)
         ndc_o = vector3(-scale_x * x / z, -scale_y * y / z, 1 + 2 * near / z)
         ndc_d = vector3(
@@ -97,7 +97,7 @@ class NdcRays:
     slope: Any  # d_z of the rays before projection
 
     def from_distance(self, t: Any) -> Any:
-        """s at distance t ≥ 0 along the original ray: t' = 1 + n / (o_z + t·d_z) (Eq. 24).
+        """s at distance t ≥ 0 along the original ray: t' = 1 + n / (o_z + t·d_z) (appendix C).
 
         0 up to the near plane; infinity is welcome.
         """

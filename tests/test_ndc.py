@@ -86,7 +86,7 @@ def test_projected_points_lie_on_the_projected_ray(
 
 @given(ndc=ndcs, seed=st.integers(0, 1 << 16))
 def test_origin_direction_and_parameter_by_the_paper(ad: Any, ndc: Ndc, seed: int) -> None:
-    """Eqs. 24 to 26 written out, with the origin on the near plane."""
+    """The formulas of appendix C written out, with the origin on the near plane."""
     o, d = (v.astype(float) for v in rays(32, seed))
     o_n = o - (ndc.near + o[:, 2:]) / d[:, 2:] * d
     ox, oy, oz = o_n.T
