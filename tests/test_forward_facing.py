@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_nerf import load_field
+from mi_nerf import hull, load_field
 from mi_nerf.backend import array_module, choose_variant
 from mi_nerf.cameras import Intrinsics, average_pose, look_at, sensor_dict
 from mi_nerf.cli import main
@@ -232,6 +233,15 @@ def test_the_field_of_a_capture(capture: Path) -> None:
     side = config.upper[0] - config.lower[0]
     # Octaves down to a period of two pixels, of 32 pixels on [−1, 1].
     assert config.position.frequencies == round(np.log2(side * 16))
+
+
+def test_silhouettes_do_not_carve_projected_boxes(capture: Path) -> None:
+    dataset = load_dataset(capture, "train")
+    assert dataset.box is not None
+    transparent = replace(dataset, has_alpha=True, images=0 * dataset.images)
+    assert hull.view_box(transparent) == dataset.box
+    assert hull.carve(transparent, *dataset.box, 8).all()
+    assert hull.tighten(transparent, *dataset.box) == dataset.box
 
 
 def test_training_learns_the_capture(forward_run: Path, tmp_path: Path) -> None:
