@@ -43,6 +43,10 @@ _FLIP_YZ = np.array([1.0, -1.0, -1.0, 1.0])
 _FLIP_XZ = np.array([-1.0, 1.0, -1.0, 1.0])
 _FLIP_XY = np.array([-1.0, -1.0, 1.0, 1.0])
 
+# How far the columns of a rotation may be from orthonormal. Files written from
+# float32 are within 1e-6; matrices that hold a scale or a shear are far outside.
+_RIGID_TOLERANCE = 1e-3
+
 
 def opengl_from_opencv(c2w: ArrayLike) -> NDArray[np.float64]:
     """OpenCV camera-to-world matrices (..., 4, 4) in OpenGL's axes."""
@@ -81,6 +85,21 @@ def _flip(c2w: ArrayLike, signs: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.multiply(matrices, signs)
 
 
+def is_rigid(c2w: ArrayLike) -> bool:
+    """Whether a matrix, (4, 4), is a rotation and a translation, up to rounding.
+
+    Scale, shear, mirroring, NaN and infinity make it something else.
+    """
+    matrix = np.asarray(c2w, np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        return False
+    rotation, bottom = matrix[:3, :3], matrix[3]
+    deviation = max(
+        np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(bottom - [0, 0, 0, 1]).max()
+    )
+    return bool(deviation <= _RIGID_TOLERANCE and np.linalg.det(rotation) > 0)
+
+
 def look_at(
     origin: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)
 ) -> NDArray[np.float64]:
@@ -116,6 +135,22 @@ def look_at(
     c2w = np.eye(4)
     c2w[:3] = np.stack([right, np.cross(back, right), back, position], axis=1)
     return c2w
+
+
+def average_pose(c2w: ArrayLike) -> NDArray[np.float64]:
+    """The camera in the middle of others: mean position, mean backward and upward axes.
+
+    Args:
+        c2w: OpenGL camera-to-world matrices, (N, 4, 4).
+
+    Returns:
+        The matrix, (4, 4).
+
+    Raises:
+        InputError: The axes cancel or are parallel.
+    """
+    _, up, back, position = (np.asarray(c2w, np.float64)[:, :3, i].mean(axis=0) for i in range(4))
+    return look_at(position, position - back, up)
 
 
 # --------------------------------------------------------------------------

@@ -17,6 +17,7 @@ import numpy as np
 
 from .arrays import upload, vector3_type
 from .field import ColorSpace, Corner
+from .ndc import Ndc
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,7 @@ class GaussianField:
     """:class:`GaussianConfig` behind the Field protocol; every number is differentiable."""
 
     color_space: ColorSpace = "linear"
+    ndc: Ndc | None = None
 
     def __init__(self, config: GaussianConfig, tensor_type: Any) -> None:
         half = config.extent * config.width

@@ -21,7 +21,14 @@ from .evaluation import evaluate, quality
 from .files import check_file, check_folder, make_folder, write_json
 from .generation import Options, generate
 from .generation.run import summary
-from .rendering import check_output, output_kind, run_frames, scene_frames, write_frames
+from .rendering import (
+    check_output,
+    default_path,
+    output_kind,
+    run_frames,
+    scene_frames,
+    write_frames,
+)
 from .report import report
 from .scene_library import find_scene
 from .target import open_target
@@ -115,7 +122,7 @@ class Train:
     """
 
     data: Positional[Annotated[Path, arg(metavar="DATA")]]
-    """Folder of a dataset (transforms_train.json and images)."""
+    """Folder of a dataset (images and transforms_train.json, or poses_bounds.npy)."""
     out: Path
     """Folder of the run; created."""
     preset: str = "nerf"
@@ -321,7 +328,8 @@ class Render:
     out: Annotated[Path, arg(aliases=["-o"])]
     """An .exr, .png or .mp4 file, or a folder of pictures."""
     path: Literal["orbit", "spiral", "test"] | None = None
-    """Camera path; default: orbit for runs, the scene's own sensors for XML."""
+    """Camera path; default: orbit for runs (spiral for forward-facing captures), the scene's
+    own sensors for XML."""
     frames: int | None = None
     """Frames along the path; default: 1 for a picture, 60 otherwise, all for --path test."""
     size: tuple[int, int] | None = None
@@ -362,10 +370,11 @@ class Render:
                 spp=self.spp or 0,
             )
         else:
-            path = self.path or "orbit"
+            target = open_target(self.target)
+            path = self.path or default_path(target)
             frames = 1 if picture else (0 if path == "test" else 60)
             count, images = run_frames(
-                open_target(self.target),
+                target,
                 variant,
                 path=path,
                 frames=self.frames or frames,

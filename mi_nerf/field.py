@@ -14,6 +14,7 @@ from . import network
 from .activations import ColorActivation, DensityActivation, apply_activation
 from .arrays import upload, vector3_type
 from .encoding import FourierEncoding
+from .ndc import Ndc
 from .network import NetworkConfig
 
 Corner = tuple[float, float, float]
@@ -26,11 +27,15 @@ class Field(Protocol):
 
     Positions are 3-vectors in the field's own coordinates (scene units), directions
     are unit 3-vectors of travel along the ray; N of each give N results.
+
+    With ``ndc``, the box, positions and the unit of density are those of normalised
+    device coordinates; directions are still the ones before projection.
     """
 
     lower: Corner  # corners of the box outside which the field is empty
     upper: Corner
     color_space: ColorSpace  # in which emission is expressed and composited
+    ndc: Ndc | None  # the projection in whose space the field lives; None: scene space
 
     def density(self, p: Any) -> Any:
         """σ ≥ 0 at N points, in 1/scene unit."""
@@ -58,6 +63,7 @@ class NeuralFieldConfig:
     color_activation: ColorActivation = "sigmoid"
     input_center: Corner = (0.0, 0.0, 0.0)  # the network sees (p − center) · scale
     input_scale: float = 1.0
+    ndc: Ndc | None = None  # forward-facing captures: box and positions are in its space
 
     def __post_init__(self) -> None:
         if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
@@ -148,6 +154,7 @@ class NeuralField:
         """
         self.config = config
         self.lower, self.upper, self.color_space = config.lower, config.upper, config.color_space
+        self.ndc = config.ndc
         shapes = config.shapes()
         if unknown := sorted(set(weights) - set(shapes)):
             raise ValueError(f"unexpected tensor '{unknown[0]}' for this architecture")

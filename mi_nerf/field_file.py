@@ -12,6 +12,7 @@ import numpy as np
 from .encoding import FourierEncoding
 from .errors import InputError
 from .field import NeuralField, NeuralFieldConfig
+from .ndc import Ndc
 from .network import NetworkConfig
 from .occupancy import OccupancyGrid
 from .tensor_file import Arrays, read_tensors, write_tensors
@@ -114,6 +115,8 @@ def _field_config(data: dict[str, Any]) -> NeuralFieldConfig:
     for name in ("position", "direction"):
         values[name] = FourierEncoding(**values[name])
     values["network"] = NetworkConfig(**values["network"])
+    if values.get("ndc") is not None:  # files of fields in scene space may not mention it
+        values["ndc"] = Ndc(**values["ndc"])
     return NeuralFieldConfig(**values)
 
 

@@ -40,10 +40,10 @@ def carve(dataset: Dataset, lower: Corner, upper: Corner, resolution: int) -> np
 
     Returns:
         Booleans in the shape of :func:`mi_nerf.occupancy.grid_shape`; all true for a
-        dataset without alpha.
+        dataset without alpha, or in normalised device coordinates.
     """
     shape = grid_shape(lower, upper, resolution)
-    if not dataset.has_alpha:
+    if not dataset.has_alpha or dataset.ndc is not None:
         return np.ones(shape, bool)
     size = (np.asarray(upper) - np.asarray(lower)) / np.asarray(shape)
     cells = np.arange(int(np.prod(shape)))

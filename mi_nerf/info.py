@@ -107,7 +107,8 @@ def _field_rows(path: Path, contents: FieldFile) -> dict[str, str]:
         f"{config.direction.frequencies} (direction), convention {config.position.convention}",
         "density": f"{config.density_activation}, scale {config.density_scale:.4g} 1/scene unit",
         "colour": f"{config.color_activation}, {config.color_space}",
-        "box": f"{_corner(config.lower)} to {_corner(config.upper)}",
+        "box": f"{_corner(config.lower)} to {_corner(config.upper)}"
+        + (", normalised device coordinates" if config.ndc is not None else ""),
         "sampling": f"{march.samples} strata a ray, near {march.near}, far {march.far}",
         "occupied": "no grid" if filled is None else f"{filled.mean():.1%} of {filled.shape}",
     }
@@ -120,7 +121,7 @@ def _dataset(folder: Path) -> str:
     except InputError:
         raise InputError(
             f"{folder}: expected a run with its {CONFIG}, or a dataset with "
-            "transforms_{train,val,test}.json"
+            "transforms_{train,val,test}.json or poses_bounds.npy"
         ) from None
     rows |= _provenance(folder)
     for split in splits:

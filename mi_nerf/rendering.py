@@ -20,7 +20,7 @@ from .files import check_file, check_folder, make_folder, replacing
 from .images import encoded, write_picture
 from .scene_file import load_scene
 from .target import Target
-from .trajectory import orbit_like, spiral_like
+from .trajectory import Poses, forward_spiral, orbit_like, spiral_like
 from .views import render_view
 
 Image = np.ndarray[Any, Any]
@@ -53,10 +53,7 @@ def run_frames(
         raise InputError(f"{target.path}: a field file knows no cameras, expected a run or an XML")
     dataset = _cameras(target, path)
     intrinsics = _resized(dataset.intrinsics, size)
-    if path == "test":
-        poses = dataset.evenly_spread(frames).cam_to_world if frames else dataset.cam_to_world
-    else:
-        poses = (orbit_like if path == "orbit" else spiral_like)(dataset.cam_to_world, frames)
+    poses = _path_poses(target, dataset, path, frames)
     backend = array_module(variant)
     field, occupancy = target.contents.build(backend)
 
@@ -211,6 +208,27 @@ def _cameras(target: Target, path: Path_) -> Dataset:
         raise InputError(f"{target.data}: has no test views, expected --path orbit or spiral")
     split = "test" if "test" in splits else splits[0]
     return load_dataset(target.data, split, downscale=target.downscale)
+
+
+def default_path(target: Target) -> Path_:
+    """The path that suits a run: a forward-facing capture has no other side."""
+    return "orbit" if target.contents.config.ndc is None else "spiral"
+
+
+def _path_poses(target: Target, dataset: Dataset, path: Path_, frames: int) -> Poses:
+    """The cameras of a path."""
+    poses = dataset.cam_to_world
+    if path == "test":
+        return dataset.evenly_spread(frames).cam_to_world if frames else poses
+    if dataset.ndc is None:
+        return (orbit_like if path == "orbit" else spiral_like)(poses, frames)
+    if path == "orbit":
+        raise InputError(
+            f"{target.path}: trained on a forward-facing capture, "
+            "expected --path spiral or --path test"
+        )
+    assert dataset.near is not None and dataset.far is not None  # LLFF always says so
+    return forward_spiral(poses, dataset.near, dataset.far, frames)
 
 
 def _resized(intrinsics: Intrinsics, size: tuple[int, int] | None) -> Intrinsics:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from .cameras import look_at
+from .cameras import average_pose, look_at
 
 Poses = NDArray[np.float64]
 
@@ -59,6 +59,32 @@ def spiral_like(cam_to_world: Poses, frames: int) -> Poses:
     rising = np.linspace(low, high, frames)
     turns = [orbit(center, up, radius, float(h), frames) for h in rising]
     return np.array([turn[(2 * i) % frames] for i, turn in enumerate(turns)])
+
+
+def forward_spiral(cam_to_world: Poses, near: float, far: float, frames: int) -> Poses:
+    """Two turns around the average of cameras that face forward, as in the original code.
+
+    At angle θ the camera is off by (cos θ, −sin θ, −sin ½θ) times the radii, in the axes of
+    the average camera; a radius is what 90 % of the given cameras keep within. All frames
+    look at one point on the average optical axis, whose disparity mixes that of the nearest
+    and of the farthest content 1 : 3.
+
+    Args:
+        near, far: z-depths between which the content lies.
+
+    Returns:
+        OpenGL poses, (frames, 4, 4).
+    """
+    middle = average_pose(cam_to_world)
+    offsets = (cam_to_world[:, :3, 3] - middle[:3, 3]) @ middle[:3, :3]
+    radii = np.percentile(np.abs(offsets), 90, axis=0)
+    focus = 1 / (0.25 / (0.9 * near) + 0.75 / (5 * far))
+    target = middle[:3, 3] - focus * middle[:3, 2]
+    poses = []
+    for angle in 4 * math.pi * np.arange(frames) / frames:
+        offset = radii * (math.cos(angle), -math.sin(angle), -math.sin(angle / 2))
+        poses.append(look_at(middle[:3, 3] + middle[:3, :3] @ offset, target, middle[:3, 1]))
+    return np.array(poses)
 
 
 def _ring(

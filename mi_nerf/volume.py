@@ -1,7 +1,7 @@
 """Renders rays through a field: the one path that training, evaluation and plugins share.
 
-    rays → interval in the box → strata → (cells that may hold something)
-         → (where the coarse network sees something: NeRF Sec. 5.2)
+    rays → (normalised device coordinates) → interval in the box → strata
+         → (cells that may hold something) → (where the coarse network sees something)
          → field, in blocks of constant size → quadrature
 
 The field sees its queries in blocks of a constant number of columns, so tensor-mode
@@ -13,13 +13,14 @@ block, which is what bounds the memory of a gradient.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
 
 from .arrays import gather_vector3
 from .field import Field
+from .ndc import NdcRays
 from .occupancy import OccupancyGrid
 from .quadrature import Composite, composite, sample_weights
 from .sampling import (
@@ -58,8 +59,9 @@ class MarchSettings:
 class Samples:
     """R·S samples of R rays, and which of them the field has to be asked about."""
 
-    o: Any  # R origins
-    d: Any  # R unit directions
+    o: Any  # R origins, in the space where the field lives
+    d: Any  # R unit directions in that space
+    view: Any  # R unit directions in scene space, along which the field emits
     t: Any  # R·S sample parameters
     delta: Any  # R·S interval lengths
     count: int  # S
@@ -67,6 +69,7 @@ class Samples:
     far: Any
     index: Any = None  # the M samples to evaluate, ascending
     coarse_queries: int = 0  # of the coarse network, by which the samples were placed
+    ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
 
     @property
     def rays(self) -> int:
@@ -104,16 +107,24 @@ def place_samples(
     """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
 
     ``jitter`` is passed on to :func:`mi_nerf.sampling.stratified`; ``bounds`` limits t
-    ray by ray, besides what ``settings`` say. Sample positions carry no gradient.
+    ray by ray, besides what ``settings`` say. Sample positions carry no gradient. Rays
+    are projected first where the field asks for it: samples are then evenly spread in
+    t' (NeRF, appendix C), and rays that do not face forward see nothing.
     """
+    view, ndc = d, None
+    limits = [(settings.near, settings.far), bounds or (None, None)]
     with dr.suspend_grad():
-        near, far, hit = clip_interval(
-            *box_interval(o, d, field.lower, field.upper), settings.near, settings.far
-        )
-        if bounds is not None:
-            near, far, hit = clip_interval(near, far, hit, *bounds)
+        if field.ndc is not None:
+            ndc = field.ndc.rays(o, d)
+            o, d, limits = ndc.o, ndc.d, [ndc.bounds(*limit) for limit in limits]
+        near, far, hit = box_interval(o, d, field.lower, field.upper)
+        if ndc is not None:
+            hit &= ndc.facing
+        for limit in limits:
+            near, far, hit = clip_interval(near, far, hit, *limit)
         t, delta = stratified(near, far, settings.samples, jitter)
-        samples = _select(Samples(o, d, t, delta, settings.samples, near, far), hit, occupancy)
+        samples = Samples(o, d, view, t, delta, settings.samples, near, far, ndc=ndc)
+        samples = _select(samples, hit, occupancy)
         coarse = getattr(field, "coarse", None)
         if coarse is None or not settings.fine:
             return samples
@@ -139,12 +150,13 @@ def refine(
             middle of the strata of the cumulative distribution.
     """
     with dr.suspend_grad():
-        o, d, near, far, count = samples.o, samples.d, samples.near, samples.far, samples.count
+        near, far, count = samples.near, samples.far, samples.count
         more = inverse_transform(near, far, dr.detach(weights), count, fine, jitter)
         t = merge_sorted(samples.t, more, count, fine)
         delta = cell_widths(t, near, far, count + fine)
-        merged = Samples(o, d, t, delta, count + fine, near, far)
-        merged.coarse_queries = samples.queries
+        merged = replace(
+            samples, t=t, delta=delta, count=count + fine, coarse_queries=samples.queries
+        )
         return _select(merged, far > near, occupancy)
 
 
@@ -247,15 +259,23 @@ class Evaluation:
         ray = where // samples.count
         t = dr.gather(type(samples.t), samples.t, where)
         p = points_along(samples.o, samples.d, t, ray)
-        density, emission = self._field.density_emission(p, gather_vector3(samples.d, ray))
+        density, emission = self._field.density_emission(p, gather_vector3(samples.view, ray))
         return [density, *emission]
 
 
 def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
-    """Quadrature of an evaluated batch; differentiable in density and emission."""
-    return composite(
+    """Quadrature of an evaluated batch; differentiable in density and emission.
+
+    Depth is a distance in scene space: in normalised device coordinates, that of the
+    mean t'.
+    """
+    seen = composite(
         evaluation.density, evaluation.emission, samples.t, samples.delta, samples.count
     )
+    if samples.ndc is None:
+        return seen
+    distance = samples.ndc.to_distance(seen.depth)
+    return replace(seen, depth=dr.select(seen.opacity > 0, distance, 0))
 
 
 @dataclass

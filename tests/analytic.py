@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 
 from mi_nerf.field import ColorSpace, Corner
+from mi_nerf.ndc import Ndc
 
 
 class AnalyticField:
@@ -22,9 +23,10 @@ class AnalyticField:
         lower: Corner = (-1.0, -1.0, -1.0),
         upper: Corner = (1.0, 1.0, 1.0),
         parameters: Mapping[str, Any] | None = None,
+        ndc: Ndc | None = None,
     ) -> None:
         """Without ``emission``, the field glows in (1, ½, ¼) everywhere."""
-        self.lower, self.upper = lower, upper
+        self.lower, self.upper, self.ndc = lower, upper, ndc
         self._density, self._emission = density, emission
         self._parameters = parameters or {}
         self.asked = 0  # points at which the field was looked at

@@ -84,3 +84,39 @@ def write_blob_dataset(folder: Path, *, train: int = 8, test: int = 5, size: int
         poses = orbit_poses(count, height=height)
         write_blender_dataset(folder, blob_images(poses, size, 0.6), poses, 0.6, split)
     return folder
+
+
+def forward_poses(n: int, spread: float = 0.3, seed: int = 0) -> np.ndarray:
+    """OpenGL poses around the origin, (n, 4, 4), that look roughly along -y; z is up."""
+    rng = np.random.default_rng(seed)
+    origins = rng.uniform(-spread, spread, (n, 3))
+    targets = rng.uniform(-spread, spread, (n, 3)) + (0, -5, 0)
+    return np.stack([look_at(o, t) for o, t in zip(origins, targets, strict=True)])
+
+
+def write_llff_dataset(
+    folder: Path,
+    images: np.ndarray,
+    poses: np.ndarray,
+    focal: float,
+    *,
+    bounds: tuple[float, float] = (2.0, 20.0),
+    reduced: int = 1,
+    subfolder: str = "images",
+) -> Path:
+    """Writes a capture as LLFF does; returns ``folder``.
+
+    ``images`` is (N, H, W, 3) of uint8, ``reduced`` times smaller than the film, of which
+    ``focal`` is the focal length in pixels; ``poses`` is (N, 4, 4), OpenGL.
+    """
+    (folder / subfolder).mkdir(parents=True, exist_ok=True)
+    rows = []
+    for i, (image, pose) in enumerate(zip(images, poses, strict=True)):
+        Image.fromarray(image).save(folder / subfolder / f"IMG_{i:04d}.png")
+        height, width = image.shape[0] * reduced, image.shape[1] * reduced
+        matrix = np.zeros((3, 5))
+        matrix[:, 0], matrix[:, 1], matrix[:, 2] = -pose[:3, 1], pose[:3, 0], pose[:3, 2]
+        matrix[:, 3], matrix[:, 4] = pose[:3, 3], (height, width, focal)
+        rows.append([*matrix.ravel(), *bounds])
+    np.save(folder / "poses_bounds.npy", np.array(rows))
+    return folder

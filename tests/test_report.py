@@ -18,6 +18,7 @@ from mi_nerf.backend import array_module, choose_variant
 from mi_nerf.cameras import Intrinsics
 from mi_nerf.cli import main
 from mi_nerf.errors import InputError
+from mi_nerf.ndc import Ndc
 from mi_nerf.report.view_dependence import (
     draw_view_dependence,
     emission_over_hemisphere,
@@ -65,6 +66,25 @@ def test_normals_point_out_of_a_blob(direction: Any) -> None:
     field = AnalyticField(gaussian((0.1, 0, -0.1), 0.3, 5.0))
     point = np.array([0.1, 0, -0.1]) + 0.3 * out
     assert surface_normal(field, point, BACKEND) == pytest.approx(out, abs=1e-2)
+
+
+def test_fields_of_forward_facing_captures() -> None:
+    """A ball of scene space, asked about in normalised device coordinates."""
+    ndc = Ndc(1.2, 1.6)
+    center, radius = np.array([0.2, -0.1, -3.0]), 0.4
+
+    def density(p: Any) -> Any:
+        z = 2 / (p[2] - 1)  # appendix C, solved for the original point
+        x, y = -p[0] * z / 1.2, -p[1] * z / 1.6
+        offset = type(p)(x, y, z) - type(p)(*center.tolist())
+        return dr.exp(-0.5 / radius**2 * dr.squared_norm(offset))
+
+    field = AnalyticField(density, lambda p, d: [0.5 - 0.5 * d[i] for i in range(3)], ndc=ndc)
+    out = unit(np.array([[0.3, 0.5, 0.8]]))[0]
+    point = center + radius * out
+    assert surface_normal(field, point, BACKEND) == pytest.approx(out, abs=2e-2)
+    middle = emission_over_hemisphere(field, point, out, BACKEND, 33)[16, 16, :3]
+    assert 2 * middle - 1 == pytest.approx(out, abs=1e-5)
 
 
 def test_even_density_has_no_normal() -> None:

@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 
 from ..errors import InputError
-from . import blender
+from . import blender, llff
 from .dataset import Box, ColorSpace, Dataset, evenly_spread_indices
 from .images import Progress
 
@@ -37,7 +37,8 @@ def load_dataset(
 
     Args:
         path: The dataset's folder, in Blender/NeRF layout
-            (:mod:`mi_nerf.data.blender`).
+            (:mod:`mi_nerf.data.blender`) or LLFF's (:mod:`mi_nerf.data.llff`). A folder
+            in both is a forward-facing capture: LLFF's holds.
         split: Which views, e.g. ``"train"``.
         downscale: Averages blocks of this many pixels squared, premultiplied. A
             remainder is cropped at the right and the bottom, and the intrinsics
@@ -51,7 +52,8 @@ def load_dataset(
             not as expected; the message names it.
     """
     folder = _existing_folder(path)
-    return blender.load(folder, split, downscale=downscale, limit=limit, progress=progress)
+    reader = llff if llff.recognises(folder) else blender
+    return reader.load(folder, split, downscale=downscale, limit=limit, progress=progress)
 
 
 def available_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
@@ -61,9 +63,13 @@ def available_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
         InputError: The folder does not exist or is no dataset.
     """
     folder = _existing_folder(path)
+    if llff.recognises(folder):
+        return llff.SPLITS
     splits = blender.splits(folder)
     if not splits:
-        raise InputError(f"{folder}: expected a dataset with transforms_{{train,val,test}}.json")
+        raise InputError(
+            f"{folder}: expected a dataset with transforms_{{train,val,test}}.json or {llff.POSES}"
+        )
     return splits
 
 

@@ -32,19 +32,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Intrinsics, opengl_from_mitsuba
+from ..cameras import Intrinsics, is_rigid, opengl_from_mitsuba
 from ..errors import InputError
 from .dataset import Box, Dataset, evenly_spread_indices
-from .images import Progress, read_images
+from .images import IMAGE_SUFFIXES, Progress, read_images
 
-_IMAGE_SUFFIXES = {".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
 _USUAL_SPLITS = ("train", "val", "test")
 _INTRINSIC_KEYS = ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h")
 _DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
-
-# How far the columns of a rotation may be from orthonormal. Files written from
-# float32 are within 1e-6; matrices that hold a scale or a shear are far outside.
-_RIGID_TOLERANCE = 1e-3
 
 
 def splits(folder: Path) -> tuple[str, ...]:
@@ -137,12 +132,7 @@ def _pose(file: Path, frame: dict[str, Any]) -> NDArray[np.float64]:
         raise InputError(f'{where}: expected a 4x4 "transform_matrix"')
     if not np.isfinite(pose).all():
         raise InputError(f'{where}: "transform_matrix" holds NaN or infinity')
-    rotation, bottom = pose[:3, :3], pose[3]
-    if (
-        np.abs(rotation.T @ rotation - np.eye(3)).max() > _RIGID_TOLERANCE
-        or np.abs(bottom - [0, 0, 0, 1]).max() > _RIGID_TOLERANCE
-        or np.linalg.det(rotation) < 0
-    ):
+    if not is_rigid(pose):
         raise InputError(
             f'{where}: expected a rigid "transform_matrix" '
             "(a rotation without scale, shear or mirroring, and a translation)"
@@ -230,7 +220,7 @@ def _intrinsics(file: Path, meta: dict[str, Any], width: int, height: int) -> In
 def _image_path(file: Path, frame: dict[str, Any]) -> Path:
     """Where the frame's image is; names may contain dots, so not every suffix counts."""
     path = file.parent / str(frame["file_path"])
-    if path.suffix.lower() not in _IMAGE_SUFFIXES:
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
         path = path.with_name(path.name + ".png")
     if not path.is_file():
         raise InputError(f'{path}: no such image, expected by {file}, "{frame["file_path"]}"')

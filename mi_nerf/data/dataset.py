@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..cameras import Intrinsics
 from ..errors import InputError
+from ..ndc import Ndc
 
 ColorSpace = Literal["srgb", "linear"]
 Box = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -37,6 +38,8 @@ class Dataset:
     near: float | None = None  # z-depths between which the scene lies, scene units,
     far: float | None = None  # where the dataset says so
     box: Box | None = None  # (min, max) corners of the scene, world space, likewise
+    # Forward-facing captures: the projection that tames their depth; `box` is then in its space.
+    ndc: Ndc | None = None
 
     def __post_init__(self) -> None:
         n, size = len(self.names), (self.intrinsics.height, self.intrinsics.width)

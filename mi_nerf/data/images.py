@@ -22,6 +22,8 @@ from PIL import Image
 from ..errors import InputError
 from .dataset import ColorSpace
 
+IMAGE_SUFFIXES = {".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
+
 # Called as progress(done, total), always from the thread that asked for the images.
 Progress = Callable[[int, int], None]
 

@@ -43,6 +43,9 @@ class NerfMedium(mi.Medium):
     coordinate system into the scene: with the identity the field appears where it was
     trained, and moving, rotating or scaling the cube does the same to the field. The
     field fills its own box, which need not be the cube [−1, 1]³; ``mi-nerf info`` prints it.
+    A field of a forward-facing capture lives in normalised device coordinates: in its own
+    coordinate system it fills all of z ≤ −1 that the views saw, up to infinity, for rays
+    that descend along −z.
 
     Only the integrator ``nerf`` shows it: Mitsuba's own volume integrators have no notion
     of emission that depends on direction.

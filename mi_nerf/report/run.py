@@ -13,7 +13,7 @@ from ..data import load_dataset
 from ..errors import InputError
 from ..files import make_folder, replacing, write_json
 from ..target import Target
-from .view_dependence import draw_view_dependence, find_points
+from .view_dependence import draw_view_dependence, field_position, find_points
 
 Point = tuple[float, float, float]
 
@@ -38,8 +38,8 @@ def report(
     backend = array_module(variant)
     field, occupancy = target.contents.build(backend)
     for point in points:
-        inside = all(a <= v <= b for a, v, b in zip(field.lower, point, field.upper, strict=True))
-        if not inside:
+        place = field_position(field, np.array(point, np.float64)[:, None])[:, 0]
+        if not (np.array(field.lower) <= place).all() or not (place <= field.upper).all():
             raise InputError(
                 f"--point {' '.join(map(str, point))}: outside the field's box "
                 f"{field.lower} to {field.upper}"

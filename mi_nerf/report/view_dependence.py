@@ -29,7 +29,7 @@ def emission_over_hemisphere(
     """The colour that leaves a point towards each direction of a hemisphere.
 
     Args:
-        point: in the field's coordinates.
+        point: in the coordinates of the field's rays.
         normal: unit vector in the middle of the hemisphere.
         size: pixels across the disc on which the hemisphere is projected from above.
 
@@ -42,13 +42,22 @@ def emission_over_hemisphere(
     height = np.sqrt(np.maximum(1 - x**2 - y**2, 0))
     towards = x[..., None] * side - y[..., None] * front + height[..., None] * normal
     towards = towards[inside]
-    p = np.repeat(np.asarray(point, np.float32)[:, None], len(towards), axis=1)
+    p = np.repeat(np.asarray(point, np.float64)[:, None], len(towards), axis=1)
+    p = _vectors(backend, field_position(field, p))
     # Light that leaves towards ω is seen by rays that travel along −ω.
-    _, color = field.density_emission(_vectors(backend, p), _vectors(backend, -towards.T))
+    _, color = field.density_emission(p, _vectors(backend, -towards.T))
     image = np.zeros((size, size, 4))
     image[inside, :3] = np.stack([np.array(c) for c in color], axis=-1)
     image[inside, 3] = 1
     return image
+
+
+def field_position(field: Field, p: Array) -> Array:
+    """Points (3, N) where the field is asked about them: projected, if it lives in NDC."""
+    if field.ndc is None:
+        return p
+    x, y, z, w = field.ndc.matrix() @ np.concatenate([p, np.ones_like(p[:1])])
+    return np.array([x, y, z]) / w
 
 
 def surface_normal(field: Field, point: Sequence[float], backend: Any) -> Array:
@@ -59,7 +68,8 @@ def surface_normal(field: Field, point: Sequence[float], backend: Any) -> Array:
     """
     extent = max(b - a for a, b in zip(field.lower, field.upper, strict=True))
     offsets = np.concatenate([np.eye(3), -np.eye(3)]) * _STEP * extent
-    density = np.array(field.density(_vectors(backend, (np.asarray(point) + offsets).T)))
+    positions = field_position(field, (np.asarray(point) + offsets).T)
+    density = np.array(field.density(_vectors(backend, positions)))
     slope = density[:3].astype(np.float64) - density[3:]
     length = np.linalg.norm(slope)
     if not length > 0:

@@ -94,7 +94,11 @@ class OptimizerConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A training run, resolved: what ``config.json`` records."""
+    """A training run, resolved: what ``config.json`` records.
+
+    For forward-facing captures, ``box`` and all that counts per length of it is in
+    normalised device coordinates.
+    """
 
     preset: str = "nerf"
     seed: int = 0

@@ -62,6 +62,7 @@ def field_config(config: TrainConfig, dataset: Dataset) -> NeuralFieldConfig:
         density_shift=config.density.shift,
         density_scale=config.density.gain,
         color_activation=color,
+        ndc=dataset.ndc,
     )
     return model.in_box(lower, upper)
 
@@ -75,7 +76,10 @@ def resolved_octaves(dataset: Dataset, lower: Corner, upper: Corner) -> int:
     center = (np.asarray(lower) + np.asarray(upper)) / 2
     distance = np.median(np.linalg.norm(dataset.cam_to_world[:, :3, 3] - center, axis=1))
     side = max(b - a for a, b in zip(lower, upper, strict=True))
-    pixels = side * dataset.intrinsics.fx / max(float(distance), 1e-9 * side)
+    film = dataset.intrinsics
+    pixels = side * film.fx / max(float(distance), 1e-9 * side)
+    if dataset.ndc is not None:  # where the film spans [−1, 1] at any distance
+        pixels = side * max(film.width, film.height) / 2
     return int(np.clip(round(math.log2(max(pixels, 2.0))), 1, 12))
 
 
