@@ -107,7 +107,10 @@ LONG = "/a/very/long/path/that/fits/in/no/line/of/a/terminal/of/eighty/columns/a
     [
         # ---- What the parser itself refuses ----
         ("trian {data}", "trian: unknown command, did you mean train?"),
-        ("qqq", "qqq: unknown command, expected one of demo, generate, train, eval, render, info"),
+        (
+            "qqq",
+            "qqq: unknown command, expected one of demo, generate, train, eval, render, import",
+        ),
         ("--qqq", "--qqq: unknown option of mi-nerf, see mi-nerf --help"),
         ("train", "train: missing DATA and --out PATH, see mi-nerf train --help"),
         ("train {data}", "train: missing --out PATH"),
