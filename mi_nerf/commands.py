@@ -349,8 +349,8 @@ class Import:
     convention: Convention = "one"
     """Frequencies of the encoding: 2^k (one), as both codes have them, times pi or two_pi."""
     occupancy: int | None = None
-    """Find empty space on a grid of so many cells along the longest side, and skip it from then
-    on: much faster to render; default: none."""
+    """Find empty space on a grid of so many cells along the longest side, say 64, so that rendering
+    skips it; takes seconds to minutes and renders about ten times as fast; default: none."""
     variant: Variant = None
 
     def run(self, _started: float) -> None:

@@ -34,7 +34,7 @@ Which = Literal["fine", "coarse"]
 # Optical thickness below which a cell counts as empty, as in training, and how often a
 # random point of each cell is looked at before it does.
 _THRESHOLD = 0.01
-_LOOKS = 8
+_LOOKS = 4
 _BLOCK = 16384
 
 

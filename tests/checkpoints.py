@@ -38,23 +38,24 @@ class Pickler:
         self.storages: list[np.ndarray] = []
 
     def dump(self, value: Any) -> bytes:
-        return b"\x80\x02" + self._write(value) + b"."
+        return b"\x80\x02" + self.write(value) + b"."
 
-    def _write(self, value: Any) -> bytes:
+    def write(self, value: Any) -> bytes:
+        """The instructions that leave ``value`` on the stack."""
         if isinstance(value, Raw):
             return bytes(value)
         if isinstance(value, (np.ndarray, Transposed)):
             return self._tensor(value)
         if isinstance(value, dict):
-            items = b"".join(self._write(k) + self._write(v) for k, v in value.items())
+            items = b"".join(self.write(k) + self.write(v) for k, v in value.items())
             if isinstance(value, State):
-                attributes = self._write({"_metadata": {"": {"version": 1}}})
+                attributes = self.write({"_metadata": {"": {"version": 1}}})
                 return b"ccollections\nOrderedDict\n)R(" + items + b"u" + attributes + b"b"
             return b"}(" + items + b"u"
         if isinstance(value, list):
-            return b"](" + b"".join(map(self._write, value)) + b"e"
+            return b"](" + b"".join(map(self.write, value)) + b"e"
         if isinstance(value, tuple):
-            return b"(" + b"".join(map(self._write, value)) + b"t"
+            return b"(" + b"".join(map(self.write, value)) + b"t"
         if isinstance(value, str):
             return b"X" + struct.pack("<I", len(value.encode())) + value.encode()
         if value is None or isinstance(value, bool):
@@ -71,10 +72,10 @@ class Pickler:
         kind = Raw(f"ctorch\n{_TYPES[array.dtype.str[1:]]}Storage\n".encode())
         key = str(100 + len(self.storages))
         self.storages.append(flat)
-        storage = self._write(("storage", kind, key, "cuda:0", flat.size, None)) + b"Q"
+        storage = self.write(("storage", kind, key, "cuda:0", flat.size, None)) + b"Q"
         hooks = Raw(b"ccollections\nOrderedDict\n)R")
         arguments = (Raw(storage), 0, array.shape, strides, False, hooks)
-        return b"ctorch._utils\n_rebuild_tensor_v2\n" + self._write(arguments) + b"R"
+        return b"ctorch._utils\n_rebuild_tensor_v2\n" + self.write(arguments) + b"R"
 
 
 def write_old(path: Path, content: Any) -> Path:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import pickle
-import struct
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -22,7 +21,7 @@ from mi_nerf.field_file import FieldFile
 from mi_nerf.importing import ImportSettings, import_network
 from mi_nerf.info import describe
 from tests.arrays import unit, vectors
-from tests.checkpoints import WRITERS, Raw, State, Transposed, write_old, write_zip
+from tests.checkpoints import WRITERS, Pickler, Raw, State, Transposed, write_old, write_zip
 from tests.fields import scene_dict
 
 Arrays = dict[str, Any]
@@ -489,20 +488,11 @@ def test_views_beyond_their_storage(
     tmp_path: Path, refused: Refused, offset: Any, shape: Any, strides: Any, said: str
 ) -> None:
     kind = Raw(b"ctorch\nFloatStorage\n")
-    storage = ("storage", kind, "100", "cpu", 4)
-    rebuild = Raw(b"ctorch._utils\n_rebuild_tensor_v2\n")
-    call = [rebuild, (storage, offset, shape, strides)]
-    body = write_zip(tmp_path / "c.ckpt", {"x": call})
-    with zipfile.ZipFile(body) as archive:
-        data = archive.read("archive/data.pkl")
-    # The list [function, (storage tuple, …)] becomes a call on a storage.
-    data = data.replace(b"](ctorch._utils", b"ctorch._utils").replace(b"teu.", b"tRu.")
-    head, tail = data.split(b"K\x04" if b"K\x04" in data else b"J" + struct.pack("<i", 4), 1)
-    four = b"J" + struct.pack("<i", 4)
-    data = head + four + b"tQ" + tail[1:]
-    with zipfile.ZipFile(body, "w") as archive:
-        archive.writestr("archive/data.pkl", data)
-    assert said in import_refused(refused, body)
+    storage = Raw(Pickler().write(("storage", kind, "100", "cpu", 4)) + b"Q")
+    arguments = Pickler().write((storage, offset, shape, strides))
+    tensor = Raw(b"ctorch._utils\n_rebuild_tensor_v2\n" + arguments + b"R")
+    path = write_zip(tmp_path / "c.ckpt", {"x": tensor})
+    assert said in import_refused(refused, path)
 
 
 @pytest.mark.parametrize("format", WRITERS)
