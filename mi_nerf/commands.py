@@ -16,11 +16,14 @@ from . import info
 from .ablation import ROWS, ablate, table
 from .backend import choose_variant
 from .demo import run_demo
+from .encoding import Convention
 from .errors import InputError
 from .evaluation import evaluate, quality
+from .field_file import save_field
 from .files import check_file, check_folder, make_folder, write_json
 from .generation import Options, generate
 from .generation.run import summary
+from .importing import ImportSettings, import_network, occupied_cells
 from .rendering import (
     check_output,
     default_path,
@@ -417,6 +420,74 @@ class Report:
 
 
 @dataclass(frozen=True)
+class Import:
+    """Makes a field file from a network that another NeRF code has trained.
+
+    Reads the PyTorch checkpoints of two codes: the port of the original one
+    (network_fn_state_dict, network_fine_state_dict) and the one with flexible models
+    (model_coarse_state_dict, model_fine_state_dict). The architecture follows from their
+    tensors; PyTorch is not needed, and nothing that a checkpoint contains is run. Networks
+    trained in normalised device coordinates (forward-facing scenes) cannot be placed in a
+    world, and frequencies other than powers of two are not told apart.
+
+    Examples:
+
+    mi-nerf import checkpoint199999.ckpt -o lego.safetensors
+
+    mi-nerf import 200000.tar -o room.safetensors --box -4 -4 -1 4 4 3 --samples 512
+    """
+
+    checkpoint: Positional[Annotated[Path, arg(metavar="CKPT")]]
+    """A file written by torch.save."""
+    out: Annotated[Path, arg(aliases=["-o"])]
+    """The field file, .safetensors; an existing one is replaced."""
+    network: Literal["fine", "coarse"] | None = None
+    """Which of the two; default: the fine one where there is one."""
+    box: tuple[float, float, float, float, float, float] = (-1.5, -1.5, -1.5, 1.5, 1.5, 1.5)
+    """Minima and maxima of x, y and z; nothing is seen outside. Default: what holds the objects
+    of nerf_synthetic."""
+    samples: int = 256
+    """Samples on each ray through the box."""
+    convention: Convention = "one"
+    """Frequencies of the encoding: 2^k (one), as both codes have them, times pi or two_pi."""
+    occupancy: int | None = None
+    """Find empty space on a grid of so many cells along the longest side, say 64, so that rendering
+    skips it; takes seconds to minutes and renders about ten times as fast; default: none."""
+    variant: Variant = None
+
+    def run(self, _started: float) -> None:
+        """Imports."""
+        if not all(math.isfinite(v) for v in self.box) or not all(
+            self.box[i] < self.box[i + 3] for i in range(3)
+        ):
+            raise InputError(
+                f"--box {' '.join(f'{v:g}' for v in self.box)}: expected three minima, then "
+                "three larger maxima"
+            )
+        _positive("samples", self.samples)
+        if self.occupancy is not None and not 1 <= self.occupancy <= 512:
+            raise InputError(f"--occupancy {self.occupancy}: expected 1 to 512 cells")
+        if self.out.suffix.lower() != ".safetensors":
+            raise InputError(f"{self.out}: expected an output file .safetensors")
+        check_file(self.out)
+        settings = ImportSettings(
+            self.network, self.box[:3], self.box[3:], self.samples, self.convention
+        )
+        contents = import_network(self.checkpoint, settings)
+        if self.occupancy is not None:
+            variant = choose_variant(self.variant)
+            cells = occupied_cells(contents, variant, self.occupancy)
+            contents = replace(contents, occupancy=cells)
+        make_folder(self.out.parent)
+        save_field(self.out, contents)
+        net, position = contents.config.network, contents.config.position
+        print(
+            f"{self.out}: {contents.provenance['state_dict']}, {net.depth}x{net.width} with "
+            f"{position.frequencies} octaves, {contents.config.parameter_count()} parameters"
+        )
+
+
+@dataclass(frozen=True)
 class Info:
     """Says what this machine offers, or what a run, checkpoint, field or dataset holds.
 
@@ -472,6 +543,7 @@ COMMANDS = {
     "eval": Eval,
     "render": Render,
     "report": Report,
+    "import": Import,
     "info": Info,
 }
 

@@ -23,7 +23,7 @@ from .training.presets import preset
 
 Image = np.ndarray[Any, Any]
 
-SCENE = "spheres"
+SCENE = "arches"
 
 
 def run_demo(

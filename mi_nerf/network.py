@@ -29,6 +29,7 @@ class NetworkConfig:
     width: int = 256  # neurons a trunk layer
     skip: int = 5  # trunk layer (counted from 0) that sees γ(x) again; −1: none
     feature_layer: bool = True  # a linear layer between trunk and view branch
+    feature_relu: bool = False  # a ReLU after it, as some ports of the original have
     view_depth: int = 1  # layers of the view branch; 0: colour straight from the feature
     view_width: int = 128  # neurons a view-branch layer
     view_dependent: bool = True  # False: the view branch does not see the direction
@@ -42,6 +43,8 @@ class NetworkConfig:
             raise ValueError(
                 f"network: skip={self.skip}, expected -1 (none) or a layer from 1 to depth-1"
             )
+        if self.feature_relu and not self.feature_layer:
+            raise ValueError("network: feature_relu=True, expected feature_layer=True with it")
 
     def shapes(self, position_size: int, direction_size: int) -> dict[str, tuple[int, ...]]:
         """Names and shapes of all parameters; weights are ``(outputs, inputs)``."""
@@ -149,7 +152,7 @@ def density_head(weights: dict[str, Any], h: Any) -> Any:
 def color_head(config: NetworkConfig, weights: dict[str, Any], h: Any, direction: Any) -> list[Any]:
     """Raw colour of N queries, one array a channel; ``direction`` is γ(d) as a tensor."""
     if config.feature_layer:
-        h = _layer(weights, "feature", h, {})
+        h = _layer(weights, "feature", h, {}, rectify=config.feature_relu)
     seen = {"direction_weight": direction} if config.view_dependent else {}
     for i in range(config.view_depth):
         h = _layer(weights, f"view_{i}", h, seen if i == 0 else {}, rectify=True)

@@ -20,6 +20,7 @@ CONFIGS = {
     "skip in the last layer": NetworkConfig(depth=3, width=16, skip=2, view_width=8),
     "no skip": NetworkConfig(depth=4, width=16, skip=-1, view_width=8),
     "no feature layer": NetworkConfig(depth=4, width=16, skip=1, feature_layer=False, view_width=8),
+    "rectified feature": NetworkConfig(depth=2, width=16, skip=-1, feature_relu=True, view_width=8),
     "one layer": NetworkConfig(depth=1, width=16, skip=-1, view_width=8),
     "deep view branch": NetworkConfig(depth=2, width=16, skip=1, view_depth=3, view_width=8),
     "no view branch": NetworkConfig(depth=2, width=16, skip=1, view_depth=0),
@@ -53,6 +54,7 @@ def slow_forward(
     density = layer("density", h)[0]
     if config.feature_layer:
         h = layer("feature", h)
+        h = np.maximum(h, 0) if config.feature_relu else h
     if config.view_dependent:
         h = np.concatenate([h, d])
     for i in range(config.view_depth):
@@ -106,6 +108,7 @@ def test_published_shapes() -> None:
     ("change", "named"),
     [
         ({"depth": 0}, "depth=0"),
+        ({"feature_relu": True, "feature_layer": False}, "expected feature_layer=True"),
         ({"width": 0}, "width=0"),
         ({"view_depth": -1}, "view_depth=-1"),
         ({"view_width": 0}, "view_width=0"),
