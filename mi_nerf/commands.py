@@ -423,12 +423,10 @@ class Report:
 class Import:
     """Makes a field file from a network that another NeRF code has trained.
 
-    Reads the PyTorch checkpoints of two codes: the port of the original one
-    (network_fn_state_dict, network_fine_state_dict) and the one with flexible models
-    (model_coarse_state_dict, model_fine_state_dict). The architecture follows from their
-    tensors; PyTorch is not needed, and nothing that a checkpoint contains is run. Networks
-    trained in normalised device coordinates (forward-facing scenes) cannot be placed in a
-    world, and frequencies other than powers of two are not told apart.
+    Reads checkpoints of the PyTorch port of the original code (network_fn_state_dict) and of the
+    one with flexible models (model_coarse_state_dict). PyTorch is not needed, and nothing that a
+    checkpoint contains is run. Networks trained in normalised device coordinates have no place in
+    a world, and frequencies other than powers of two are not told apart.
 
     Examples:
 
