@@ -440,12 +440,14 @@ class Import:
     out: Annotated[Path, arg(aliases=["-o"])]
     """The field file, .safetensors; an existing one is replaced."""
     network: Literal["fine", "coarse"] | None = None
-    """Which of the two; default: the fine one where there is one."""
+    """Only one of the two; default: both, the coarse one placing the samples of the fine one."""
     box: tuple[float, float, float, float, float, float] = (-1.5, -1.5, -1.5, 1.5, 1.5, 1.5)
     """Minima and maxima of x, y and z; nothing is seen outside. Default: what holds the objects
     of nerf_synthetic."""
-    samples: int = 256
-    """Samples on each ray through the box."""
+    samples: int | None = None
+    """Samples on each ray through the box; default: 64, or 256 of a single network."""
+    fine: int | None = None
+    """Samples more, where the coarse network sees something; default: 128."""
     convention: Convention = "one"
     """Frequencies of the encoding: 2^k (one), as both codes have them, times pi or two_pi."""
     occupancy: int | None = None
@@ -462,14 +464,17 @@ class Import:
                 f"--box {' '.join(f'{v:g}' for v in self.box)}: expected three minima, then "
                 "three larger maxima"
             )
-        _positive("samples", self.samples)
+        if self.samples is not None:
+            _positive("samples", self.samples)
+        if self.fine is not None and self.fine < 0:
+            raise InputError(f"--fine {self.fine}: expected 0 or more")
         if self.occupancy is not None and not 1 <= self.occupancy <= 512:
             raise InputError(f"--occupancy {self.occupancy}: expected 1 to 512 cells")
         if self.out.suffix.lower() != ".safetensors":
             raise InputError(f"{self.out}: expected an output file .safetensors")
         check_file(self.out)
         settings = ImportSettings(
-            self.network, self.box[:3], self.box[3:], self.samples, self.convention
+            self.network, self.box[:3], self.box[3:], self.samples, self.fine, self.convention
         )
         contents = import_network(self.checkpoint, settings)
         if self.occupancy is not None:
@@ -481,7 +486,7 @@ class Import:
         net, position = contents.config.network, contents.config.position
         print(
             f"{self.out}: {contents.provenance['state_dict']}, {net.depth}x{net.width} with "
-            f"{position.frequencies} octaves, {contents.config.parameter_count()} parameters"
+            f"{position.frequencies} octaves, {contents.parameter_count()} parameters"
         )
 
 

@@ -42,16 +42,19 @@ _BLOCK = 16384
 class ImportSettings:
     """What a checkpoint does not say."""
 
-    network: Which | None = None  # none: the fine one where there is one
+    network: Which | None = None  # none: the fine one, the coarse one placing its samples
     # The objects of nerf_synthetic, which these codes are mostly trained on, lie within.
     lower: Corner = (-1.5, -1.5, -1.5)
     upper: Corner = (1.5, 1.5, 1.5)
-    samples: int = 256  # strata a ray; the codes take 64 + 128 where they expect the surface
+    samples: int | None = None  # strata a ray; none: 64, or 256 of a single network
+    fine: int | None = None  # more, where the coarse network sees something; none: 128
     convention: Convention = "one"  # frequencies 2^k, 2^k·π or 2^k·2π
 
 
 def import_network(path: str | Path, settings: ImportSettings) -> FieldFile:
     """Reads a checkpoint of either layout as a field; runs nothing that it contains.
+
+    With two networks of one architecture, the coarse one places the fine one's samples.
 
     Raises:
         InputError: if it is damaged, of another layout, or an architecture that a field
@@ -59,6 +62,24 @@ def import_network(path: str | Path, settings: ImportSettings) -> FieldFile:
     """
     checkpoint = read_checkpoint(path)
     layout, key = _find(checkpoint, settings.network)
+    config, weights = _read_network(checkpoint, layout, key, settings)
+    coarse, coarse_key = None, layout.keys["coarse"]
+    if settings.network is None and key != coarse_key and coarse_key in checkpoint.content:
+        coarse_config, coarse = _read_network(checkpoint, layout, coarse_key, settings)
+        coarse = coarse if coarse_config == config else None
+    samples, fine = (64, 128) if coarse is not None else (256, 0)
+    march = MarchSettings(
+        samples=samples if settings.samples is None else settings.samples,
+        fine=fine if settings.fine is None or coarse is None else settings.fine,
+    )
+    provenance = {"imported_from": Path(path).name, "state_dict": key}
+    return FieldFile(config, weights, march=march, provenance=provenance, coarse=coarse)
+
+
+def _read_network(
+    checkpoint: Checkpoint, layout: _Layout, key: str, settings: ImportSettings
+) -> tuple[NeuralFieldConfig, Arrays]:
+    """One network of a checkpoint: its architecture and its weights."""
     tensors = _Tensors(checkpoint, key)
     parts = layout.read(tensors)
     tensors.require_all_used()
@@ -77,9 +98,7 @@ def import_network(path: str | Path, settings: ImportSettings) -> FieldFile:
         density_activation="relu",
         density_shift=0.0,
     )
-    provenance = {"imported_from": Path(path).name, "state_dict": key}
-    march = MarchSettings(samples=settings.samples)
-    return FieldFile(config, weights, march=march, provenance=provenance)
+    return config, weights
 
 
 def occupied_cells(contents: FieldFile, variant: str, resolution: int) -> np.ndarray[Any, Any]:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from mi_nerf import load_field
 from mi_nerf.cli import main
 from mi_nerf.field import NeuralField
-from mi_nerf.field_file import FieldFile
+from mi_nerf.field_file import FieldFile, save_field
 from mi_nerf.importing import ImportSettings, import_network
 from mi_nerf.info import describe
 from tests.arrays import unit, vectors
@@ -316,6 +316,30 @@ def test_fine_is_the_default(tmp_path: Path) -> None:
     assert np.array_equal(bias(ImportSettings("coarse")), coarse["pts_linears.0.bias"])
     path = write_zip(tmp_path / "c.ckpt", {FLEXIBLE[0]: State(flexible()), FLEXIBLE[1]: None})
     assert import_network(path, ImportSettings()).provenance["state_dict"] == FLEXIBLE[0]
+
+
+def test_the_coarse_network_places_samples(tmp_path: Path) -> None:
+    fine, coarse = original(seed=1), original(seed=2)
+    path = write_zip(tmp_path / "c.ckpt", content(ORIGINAL, State(fine), State(coarse)))
+    both = import_network(path, ImportSettings())
+    assert both.coarse is not None
+    assert np.array_equal(both.coarse["trunk_0.bias"], coarse["pts_linears.0.bias"])
+    assert (both.march.samples, both.march.fine) == (64, 128)
+    told = import_network(path, ImportSettings(samples=32, fine=16)).march
+    assert (told.samples, told.fine) == (32, 16)
+    for only in ("fine", "coarse"):
+        one = import_network(path, ImportSettings(only))
+        assert one.coarse is None and (one.march.samples, one.march.fine) == (256, 0)
+    other = original(1, 4)  # of another architecture: of no use to this field
+    path = write_zip(tmp_path / "d.ckpt", content(ORIGINAL, State(fine), State(other)))
+    one = import_network(path, ImportSettings())
+    assert one.coarse is None and (one.march.samples, one.march.fine) == (256, 0)
+    out = tmp_path / "field.safetensors"
+    save_field(out, both)
+    again = load_field(out)
+    assert again.coarse is not None and again.march == both.march
+    for name, array in both.coarse.items():
+        assert np.array_equal(again.coarse[name], array)
 
 
 def test_against_pytorch(ad: Any, tmp_path: Path) -> None:
