@@ -61,3 +61,14 @@ def encoded(image: Image) -> Image:
     straight = image[..., :3] / np.where(alpha > 0, alpha, 1)
     color = np.where(alpha > 0, linear_to_srgb(straight), 0)
     return np.concatenate([np.clip(color, 0, 1), alpha], axis=-1)
+
+
+def on_white(image: Image) -> Image:
+    """What a viewer shows, before rounding: (..., 3) sRGB in [0, 1], composited in sRGB.
+
+    Args:
+        image: (..., 4) linear premultiplied RGBA.
+    """
+    straight = encoded(image)
+    shown: Image = straight[..., :3] * straight[..., 3:] + (1 - straight[..., 3:])
+    return shown

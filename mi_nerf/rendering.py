@@ -17,7 +17,7 @@ from .color import srgb_to_linear
 from .data import Dataset, available_splits, load_dataset
 from .errors import InputError
 from .files import check_file, check_folder, make_folder, replacing
-from .images import encoded, write_picture
+from .images import on_white, write_picture
 from .scene_file import load_scene
 from .target import Target
 from .trajectory import Poses, forward_spiral, orbit_like, spiral_like
@@ -193,9 +193,7 @@ def _write_video(target: Path, frames: Frames, fps: int) -> None:
                 # Players want even sizes: an odd one grows by a copy of its last row or column.
                 height, width = image.shape[:2]
                 image = np.pad(image, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-                straight = encoded(image)
-                on_white = straight[..., :3] * straight[..., 3:] + 1 - straight[..., 3:]
-                writer.append_data(np.rint(on_white * 255).astype(np.uint8))
+                writer.append_data(np.rint(on_white(image) * 255).astype(np.uint8))
 
 
 def _cameras(target: Target, path: Path_) -> Dataset:

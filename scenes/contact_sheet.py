@@ -18,7 +18,7 @@ from tqdm import tqdm
 
 import mi_nerf  # noqa: F401  (finds LLVM before Mitsuba looks for it)
 from mi_nerf.backend import choose_variant
-from mi_nerf.images import encoded
+from mi_nerf.images import on_white
 from mi_nerf.scene_file import SceneFile
 
 GROUPS = ("realistic", "diffuse", "forward", "hard")
@@ -38,9 +38,8 @@ def main() -> None:
 def _tile(file: Path) -> np.ndarray[Any, Any]:
     size = str(TILE * SUPERSAMPLING)
     scene = SceneFile(file, {"width": size, "height": size, "spp": str(SPP)}).load()
-    image = encoded(np.array(mi.render(scene))[..., :4])
-    on_white = image[..., :3] * image[..., 3:] + 1 - image[..., 3:]
-    blocks = on_white.reshape(TILE, SUPERSAMPLING, TILE, SUPERSAMPLING, 3)
+    image = on_white(np.array(mi.render(scene))[..., :4])
+    blocks = image.reshape(TILE, SUPERSAMPLING, TILE, SUPERSAMPLING, 3)
     return np.asarray(blocks.mean(axis=(1, 3)))
 
 

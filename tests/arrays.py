@@ -7,11 +7,15 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from mi_nerf.arrays import upload
+
 
 def vectors(ad: Any, points: Any, precision: str = "32") -> Any:
     """N 3-vectors, (N, 3), as a Dr.Jit vector; ``ad`` is the module of a backend."""
     array, scalar = (ad.Array3f, ad.Float32) if precision == "32" else (ad.Array3f64, ad.Float64)
-    result = array(*(scalar(np.array(column)) for column in np.transpose(points)))
+    number = np.float32 if precision == "32" else np.float64
+    # Not NumPy's own memory: kernels depend on whether that happens to be aligned.
+    result = array(*(upload(scalar, np.asarray(c, number)) for c in np.transpose(points)))
     dr.make_opaque(result)
     return result
 

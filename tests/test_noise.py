@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mi_nerf.generation.noise import Noise, estimate, mean_image, on_white
+from mi_nerf.generation.noise import Noise, estimate, mean_image
+from mi_nerf.images import on_white
 from mi_nerf.metrics import to_8bit
 
 

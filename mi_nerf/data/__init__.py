@@ -52,6 +52,8 @@ def load_dataset(
             not as expected; the message names it.
     """
     folder = _existing_folder(path)
+    if downscale < 1 or downscale != int(downscale):
+        raise InputError(f"downscale must be a whole number, 1 or more, got {downscale}")
     reader = llff if llff.recognises(folder) else blender
     return reader.load(folder, split, downscale=downscale, limit=limit, progress=progress)
 

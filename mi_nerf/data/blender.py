@@ -59,8 +59,6 @@ def load(
     progress: Progress | None = None,
 ) -> Dataset:
     """Reads one split. Arguments and errors as for :func:`mi_nerf.data.load_dataset`."""
-    if downscale < 1 or downscale != int(downscale):
-        raise InputError(f"downscale must be a whole number, 1 or more, got {downscale}")
     file = folder / f"transforms_{split}.json"
     meta, frames = _read_json(file)
     _require_plain_pinhole(file, meta, frames)

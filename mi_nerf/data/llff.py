@@ -65,8 +65,6 @@ def load(
     Raises:
         InputError: Also for captures that do not face forward.
     """
-    if downscale < 1 or downscale != int(downscale):
-        raise InputError(f"downscale must be a whole number, 1 or more, got {downscale}")
     file = folder / POSES
     capture = _normalised(file, _read_rows(file))
     paths = _image_paths(folder, len(capture.cam_to_world))

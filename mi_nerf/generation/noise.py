@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..images import encoded
+from ..images import on_white
 
 Image = np.ndarray[Any, Any]
 
@@ -66,11 +66,6 @@ def mean_image(a: Image, b: Image, samples: tuple[int, int]) -> Image:
     """The mean of two renderings, weighted by their samples a pixel."""
     share = samples[0] / sum(samples)
     return (a * share + b * (1 - share)).astype(np.float32)
-
-
-def on_white(image: Image) -> Image:
-    straight = encoded(image)
-    return straight[..., :3] * straight[..., 3:] + (1 - straight[..., 3:])
 
 
 def _sum(values: Image) -> float:

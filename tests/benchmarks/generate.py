@@ -29,9 +29,10 @@ import numpy as np
 import mi_nerf
 from mi_nerf.backend import choose_variant
 from mi_nerf.generation import Options, generate
-from mi_nerf.generation.noise import mean_image, on_white
+from mi_nerf.generation.noise import mean_image
 from mi_nerf.generation.run import prepare
 from mi_nerf.generation.tracer import Tracer
+from mi_nerf.images import on_white
 from mi_nerf.metrics import to_8bit
 from mi_nerf.scene_file import SceneFile
 from mi_nerf.scene_library import find_scene
