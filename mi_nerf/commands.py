@@ -86,7 +86,7 @@ class Generate:
     center: tuple[float, float, float] | None = None
     """What cameras look at; default: the origin, or the middle of scenes beyond [-1, 1]^3."""
     radius: float | None = None
-    """Their distance from it; default: 4, or in proportion for scenes beyond [-1, 1]^3."""
+    """Distance from it (forward: how far cameras move); default: 4, or as the scene's size says."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Values of the scene's $parameters: name=value; repeatable."""
     variant: Variant = None

@@ -535,6 +535,17 @@ def test_forward_without_a_sensor(tmp_path: Path) -> None:
     assert exr(tmp_path / "data/train/r_0_depth.exr").max() > 0
 
 
+def test_forward_cameras_move_as_told(tmp_path: Path) -> None:
+    scene = ball(tmp_path, **{"<integrator": '<default name="spread" value="0.3"/><integrator'})
+    for radius, expected in ((None, 0.3), (0.1, 0.1)):
+        out = tmp_path / f"data_{radius}"
+        record = make(scene, out, small(protocol="forward", val=0, train=9, radius=radius))
+        assert record["settings"]["radius"] == expected
+        positions = np.load(out / "poses_bounds.npy")[:, :15].reshape(-1, 3, 5)[:, :, 3]
+        assert np.abs(positions - [0, -4, 0]).max() <= expected * 1.0001
+        assert np.ptp(positions[:, 0]) > expected
+
+
 def test_passes_split_the_samples() -> None:
     for samples, pixels in ((1, 10), (64, 800 * 800), (509, 1 << 20), (7, 1 << 25)):
         parts = passes(samples, pixels)
@@ -575,7 +586,8 @@ def test_many_passes_are_one_image(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         (["--center", "0", "nan", "0"], "expected three finite numbers"),
         (["--set", "radius"], "--set radius: expected name=value"),
         (["--set", "color=3"], "unused parameters"),
-        (["--protocol", "forward", "--radius", "3"], "--radius: has no meaning"),
+        (["--protocol", "forward", "--center", "3", "0", "0"], "--center: has no meaning"),
+        (["--protocol", "forward", "--radius", "0"], "--radius 0: expected a number above 0"),
     ],
 )
 def test_bad_options(

@@ -144,7 +144,7 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
         raise InputError(f"--spp {spp}: expected at least 2, of which the noise is estimated")
     up = _up_axis(options, sensor)
     if name == "forward":
-        shots = _forward(scene, sensor, box, up, size, counts, options)
+        shots = _forward(file, scene, sensor, box, up, size, counts, options)
     else:
         shots = _around(file, box, up, size, counts, options)
     return Plan(
@@ -200,6 +200,7 @@ def _around(
 
 
 def _forward(
+    file: SceneFile,
     scene: Any,
     sensor: Any,
     box: Bounds,
@@ -209,15 +210,29 @@ def _forward(
     options: Options,
 ) -> _Shots:
     """Cameras beside the scene's own, all looking the same way."""
-    for option in ("cameras", "center", "radius"):
+    for option in ("cameras", "center"):
         if getattr(options, option) is not None:
             raise InputError(f"--{option}: has no meaning for the protocol 'forward'")
     pose, angle = _own_camera(sensor, box, up)
     intrinsics = Intrinsics.from_angle_x(*size, angle)
-    spread = _SPREAD * _nearest(scene, intrinsics, pose)
+    spread = options.radius
+    if spread is None:
+        spread = _own_spread(file)
+    if spread is None:
+        spread = _SPREAD * _nearest(scene, intrinsics, pose)
+    _require_radius(spread)
     poses = viewpoints.forward(sum(counts.values()), options.seed, pose, spread)
     views = _hold_out(poses, counts, options.seed)
     return _Shots("forward", intrinsics, views, pose[:3, 3], spread)
+
+
+def _own_spread(file: SceneFile) -> float | None:
+    """How far the scene itself wants forward-facing cameras to move."""
+    told = file.default("spread")
+    try:
+        return None if told is None else float(told)
+    except ValueError:
+        raise InputError(f"{file.path}: spread '{told}', expected a number above 0") from None
 
 
 def _center_and_radius(box: Bounds, options: Options) -> tuple[Array, float]:
@@ -231,9 +246,13 @@ def _center_and_radius(box: Bounds, options: Options) -> tuple[Array, float]:
     radius = RADIUS * reach if options.radius is None else options.radius
     if not np.isfinite(center).all():
         raise InputError(f"--center {center.tolist()}: expected three finite numbers")
+    _require_radius(radius)
+    return center, radius
+
+
+def _require_radius(radius: float) -> None:
     if not 0 < radius < math.inf:
         raise InputError(f"--radius {radius:g}: expected a number above 0")
-    return center, radius
 
 
 def halves(spp: int) -> tuple[int, int]:

@@ -44,4 +44,4 @@ class Options:
     cameras: Literal["hemisphere", "sphere"] | None = None  # of the 360-degree protocols
     up: Literal["x", "y", "z"] | None = None  # vertical axis; that of the scene's sensor, or z
     center: tuple[float, float, float] | None = None  # what the cameras look at
-    radius: float | None = None  # their distance from it, scene units
+    radius: float | None = None  # their distance from it; forward: how far they move sideways
