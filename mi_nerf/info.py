@@ -15,7 +15,7 @@ from .data import available_splits, load_dataset
 from .errors import InputError
 from .field_file import FieldFile, load_field
 from .files import read_json
-from .generation.run import RECORD
+from .generation.run import RECORD, ceilings
 from .tensor_file import read_metadata, read_tensors
 from .training import checkpoint
 from .training.run import CHECKPOINT, CONFIG, FIELD, read_config
@@ -141,17 +141,12 @@ def _provenance(folder: Path) -> dict[str, str]:
         return {}
     record = read_json(folder / RECORD, "the record of a dataset")
     try:
-        settings, noise = record["settings"], record["noise"]
+        settings = record["settings"]
         return {
             "scene": f"{record['scene']['file']}, SHA-256 {record['scene']['sha256'][:16]}...",
             "path-traced": f"{settings['spp']} samples a pixel, seed {settings['seed']}, "
             f"{record['variant']}, Mitsuba {record['versions']['mitsuba']}",
-            "PSNR ceiling": ", ".join(
-                f"{split} {figures['psnr_ceiling']:.2f} dB"
-                for split, figures in noise.items()
-                if figures["psnr_ceiling"] is not None
-            )
-            or "free of noise",
+            "PSNR ceiling": ceilings(record) or "free of noise",
         }
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{folder / RECORD}: damaged record of a dataset: {error!r}") from error

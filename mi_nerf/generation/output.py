@@ -15,10 +15,9 @@ from ..images import write_exr, write_picture
 from .llff import poses_bounds, write_llff
 from .noise import estimate, mean_image
 from .plan import Plan, View
+from .protocol import SPLITS
 from .surfaces import depth_bounds
 from .tracer import TracedView
-
-SPLITS = ("train", "val", "test")
 
 
 def write_view(folder: Path, view: View, traced: TracedView, plan: Plan) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from ..cameras import Intrinsics, look_at, opengl_from_mitsuba
 from ..errors import InputError
 from ..scene_file import Bounds, SceneFile
 from . import viewpoints
-from .protocol import CAMERA_ANGLE_X, HOLD_OUT, PROTOCOLS, RADIUS, Cameras, Options
+from .protocol import CAMERA_ANGLE_X, HOLD_OUT, PROTOCOLS, RADIUS, SPLITS, Cameras, Options
 from .surfaces import depth_bounds, trace_surfaces
 
 Array = np.ndarray[Any, Any]
@@ -39,8 +39,9 @@ class View:
 
     def render_seed(self, half: int, part: int) -> int:
         """A seed for each rendering, which does not depend on how many views there are."""
-        split = ("train", "val", "test").index(self.split)
-        sequence = np.random.SeedSequence([self.seed, split, self.index, half, part])
+        sequence = np.random.SeedSequence(
+            [self.seed, SPLITS.index(self.split), self.index, half, part]
+        )
         return int(sequence.generate_state(1, np.uint32)[0])
 
 
@@ -86,7 +87,7 @@ class Plan:
     def __str__(self) -> str:
         """The plan in a line or two, for people."""
         corners = " to ".join(_numbers(corner) for corner in self.box)
-        counts = ", ".join(f"{len(self.of_split(s))} {s}" for s in ("train", "val", "test"))
+        counts = ", ".join(f"{len(self.of_split(s))} {s}" for s in SPLITS)
         size = f"{self.intrinsics.width}x{self.intrinsics.height}"
         where = (
             f"beside {_numbers(self.center)}, up to {self.radius:.3g} from it"
@@ -100,11 +101,10 @@ class Plan:
 
     def record(self) -> dict[str, Any]:
         """What ``dataset.json`` says of it."""
-        splits = ("train", "val", "test")
         return {
             "protocol": self.protocol,
             "cameras": self.cameras,
-            "views": {split: len(self.of_split(split)) for split in splits},
+            "views": {split: len(self.of_split(split)) for split in SPLITS},
             "size": [self.intrinsics.width, self.intrinsics.height],
             "spp": self.spp,
             "seed": self.seed,
@@ -266,7 +266,7 @@ def halves(spp: int) -> tuple[int, int]:
 def _counts(name: str, options: Options) -> dict[str, int]:
     protocol = PROTOCOLS[name]
     counts = {}
-    for split in ("train", "val", "test"):
+    for split in SPLITS:
         given = getattr(options, split)
         counts[split] = getattr(protocol, split) if given is None else given
         if counts[split] < (split == "train"):

@@ -7,6 +7,7 @@ from typing import Literal
 
 Cameras = Literal["hemisphere", "sphere", "forward"]
 
+SPLITS = ("train", "val", "test")
 CAMERA_ANGLE_X = 0.6911  # the horizontal field of view of nerf_synthetic, radians
 RADIUS = 4.0  # distance of its cameras from the centre of the scene
 HOLD_OUT = 8  # forward-facing captures: every so many-th view is for testing

@@ -21,14 +21,13 @@ from ..files import check_folder, make_folder, read_json, write_json
 from ..interrupts import interruptible
 from ..scene_file import SceneFile, visible_bounds
 from .output import (
-    SPLITS,
     is_intact,
     write_forward_capture,
     write_transforms,
     write_view,
 )
 from .plan import Plan, View, make_plan, protocol_name
-from .protocol import Options
+from .protocol import SPLITS, Options
 from .tracer import Tracer
 
 RECORD = "dataset.json"
@@ -87,13 +86,17 @@ def summary(record: dict[str, Any]) -> str:
     size = "x".join(str(n) for n in record["settings"]["size"])
     if not record["complete"]:
         return f"{done} of {wanted} views; interrupted, go on with --resume"
-    ceilings = [
+    known = ceilings(record)
+    return f"{done} views of {size}, {f'PSNR ceiling {known}' if known else 'free of noise'}"
+
+
+def ceilings(record: dict[str, Any]) -> str:
+    """The PSNR ceiling of every split that has one, for people."""
+    return ", ".join(
         f"{split} {noise['psnr_ceiling']:.2f} dB"
         for split, noise in record["noise"].items()
         if noise["psnr_ceiling"] is not None
-    ]
-    known = ", PSNR ceiling " + ", ".join(ceilings) if ceilings else ", free of noise"
-    return f"{done} views of {size}{known}"
+    )
 
 
 # ---- Before the first view ---------------------------------------------------

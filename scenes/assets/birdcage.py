@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
+from geometry import Array, chaikin, grid_faces, output_folder, refine, write_ply
 from PIL import Image
 
 WIRES = 40
@@ -173,23 +173,6 @@ def door() -> list[Array]:
     return [hinge + line[:, :1] * facing + line[:, 1:] * np.array([0, 0, 1]) for line in lines]
 
 
-def chaikin(points: Array, rounds: int) -> Array:
-    """Cuts the corners of a polyline, keeping its ends."""
-    for _ in range(rounds):
-        low = 0.75 * points[:-1] + 0.25 * points[1:]
-        high = 0.25 * points[:-1] + 0.75 * points[1:]
-        middle = np.stack([low, high], 1).reshape(-1, 2)
-        points = np.concatenate([points[:1], middle, points[-1:]])
-    return points
-
-
-def grid_faces(rows: int, columns: int) -> Array:
-    """Triangles of a grid of vertices, row by row."""
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
-    right, up = corner + 1, corner + columns
-    return np.concatenate([np.stack([corner, right, up + 1], 1), np.stack([corner, up + 1, up], 1)])
-
-
 def write_wedge(path: Path, profile: list[tuple[float, float]], rounds: int = 1) -> None:
     """Writes one wedge of a turned shape; ``profile`` runs upwards on its outside."""
     points = chaikin(np.array(profile), rounds)
@@ -221,17 +204,6 @@ def loft(sections: Array, columns: int) -> tuple[Array, Array, Array]:
     faces = grid_faces(len(sections), columns + 1)
     row, column = np.divmod(faces, columns + 1)
     return vertices, np.stack([u, v], -1), row * columns + column % columns
-
-
-def refine(sections: Array, count: int) -> Array:
-    """Smooth sections in between (Catmull-Rom)."""
-    t = np.linspace(0, len(sections) - 1, count)
-    i = np.minimum(t.astype(int), len(sections) - 2)
-    f = (t - i)[:, None]
-    p0, p1 = sections[np.maximum(i - 1, 0)], sections[i]
-    p2, p3 = sections[i + 1], sections[np.minimum(i + 2, len(sections) - 1)]
-    curve = 2 * p1 + (p2 - p0) * f + (2 * p0 - 5 * p1 + 4 * p2 - p3) * f**2
-    return (curve + (3 * p1 - p0 - 3 * p2 + p3) * f**3) / 2
 
 
 def bird() -> tuple[Array, Array, Array]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
+from geometry import Array, output_folder, refine, write_ply
 from PIL import Image
 
 WEDGES = 10
@@ -39,17 +39,6 @@ PADS = [
     ((-0.20, -0.34, 0.30), 0.16, 0.10, 13, 0.70),
     ((-0.03, 0.00, 0.58), 0.29, 0.24, 44, 0.90),
 ]
-
-
-def refine(points: Array, count: int) -> Array:
-    """Points in between (Catmull-Rom)."""
-    t = np.linspace(0, len(points) - 1, count)
-    i = np.minimum(t.astype(int), len(points) - 2)
-    f = (t - i)[:, None]
-    p0, p1 = points[np.maximum(i - 1, 0)], points[i]
-    p2, p3 = points[i + 1], points[np.minimum(i + 2, len(points) - 1)]
-    curve = 2 * p1 + (p2 - p0) * f + (2 * p0 - 5 * p1 + 4 * p2 - p3) * f**2
-    return (curve + (3 * p1 - p0 - 3 * p2 + p3) * f**3) / 2
 
 
 def grid_faces(rows: int, columns: int) -> Array:

@@ -63,3 +63,31 @@ def write_ply(
     header += [f"element face {len(faces)}", f"property list uchar {kind} vertex_indices"]
     header += ["end_header", ""]
     path.write_bytes("\n".join(header).encode() + table.tobytes() + triangles.tobytes())
+
+
+def chaikin(points: Array, rounds: int) -> Array:
+    """Cuts the corners of a polyline, keeping its ends."""
+    for _ in range(rounds):
+        low = 0.75 * points[:-1] + 0.25 * points[1:]
+        high = 0.25 * points[:-1] + 0.75 * points[1:]
+        middle = np.stack([low, high], 1).reshape(-1, points.shape[1])
+        points = np.concatenate([points[:1], middle, points[-1:]])
+    return points
+
+
+def grid_faces(rows: int, columns: int) -> Array:
+    """Triangles of a grid of vertices, row by row."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
+    right, up = corner + 1, corner + columns
+    return np.concatenate([np.stack([corner, right, up + 1], 1), np.stack([corner, up + 1, up], 1)])
+
+
+def refine(points: Array, count: int) -> Array:
+    """Points in between (Catmull-Rom)."""
+    t = np.linspace(0, len(points) - 1, count)
+    i = np.minimum(t.astype(int), len(points) - 2)
+    f = (t - i)[:, None]
+    p0, p1 = points[np.maximum(i - 1, 0)], points[i]
+    p2, p3 = points[i + 1], points[np.minimum(i + 2, len(points) - 1)]
+    curve = 2 * p1 + (p2 - p0) * f + (2 * p0 - 5 * p1 + 4 * p2 - p3) * f**2
+    return (curve + (3 * p1 - p0 - 3 * p2 + p3) * f**3) / 2

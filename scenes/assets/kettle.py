@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
+from geometry import Array, chaikin, grid_faces, output_folder, refine, write_ply
 from PIL import Image
 
 WEDGES = 10
@@ -78,23 +78,6 @@ PROFILES = {
 ROUNDING = {"shoulder": 2, "knob": 2}
 
 
-def chaikin(points: Array, rounds: int) -> Array:
-    """Cuts the corners of a polyline, keeping its ends."""
-    for _ in range(rounds):
-        low = 0.75 * points[:-1] + 0.25 * points[1:]
-        high = 0.25 * points[:-1] + 0.75 * points[1:]
-        middle = np.stack([low, high], 1).reshape(-1, points.shape[1])
-        points = np.concatenate([points[:1], middle, points[-1:]])
-    return points
-
-
-def grid_faces(rows: int, columns: int) -> Array:
-    """Triangles of a grid of vertices, row by row."""
-    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).reshape(-1)
-    right, up = corner + 1, corner + columns
-    return np.concatenate([np.stack([corner, right, up + 1], 1), np.stack([corner, up + 1, up], 1)])
-
-
 def write_wedge(path: Path, profile: Array) -> None:
     """Writes one wedge of a turned shape; u runs around it, v along its profile."""
     along = np.gradient(profile, axis=0)
@@ -116,17 +99,6 @@ def write_wedge(path: Path, profile: Array) -> None:
         normals=turned(along[:, 1], -along[:, 0]),
         uv=np.stack([u, v], -1).reshape(-1, 2),
     )
-
-
-def refine(points: Array, count: int) -> Array:
-    """Points in between (Catmull-Rom)."""
-    t = np.linspace(0, len(points) - 1, count)
-    i = np.minimum(t.astype(int), len(points) - 2)
-    f = (t - i)[:, None]
-    p0, p1 = points[np.maximum(i - 1, 0)], points[i]
-    p2, p3 = points[i + 1], points[np.minimum(i + 2, len(points) - 1)]
-    curve = 2 * p1 + (p2 - p0) * f + (2 * p0 - 5 * p1 + 4 * p2 - p3) * f**2
-    return (curve + (3 * p1 - p0 - 3 * p2 + p3) * f**3) / 2
 
 
 def sweep(sections: Array, columns: int) -> tuple[Array, Array]:
