@@ -1,0 +1,79 @@
+"""``mi-nerf ablate``: the rows of the paper's Table 2 on one dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from ..ablation import ROWS, ablate, table
+from ..backend import choose_variant
+from ..training.config import with_settings
+from ..training.presets import preset
+from .shared import Variant, positive
+
+
+@dataclass(frozen=True)
+class Ablate:
+    """Measures what each part of the model is worth (NeRF, Table 2), on one dataset.
+
+    Calling it again goes on where it was interrupted, or adds seeds and rows.
+
+    Examples:
+
+    mi-nerf ablate lego/ --out ablation/ --downscale 2 --max-seconds 300 --seeds 3
+
+    mi-nerf ablate lego/ --out quick/ --rows no-pe no-vd complete --downscale 4 --steps 2000
+    """
+
+    data: Positional[Annotated[Path, arg(metavar="DATA")]]
+    """Folder of a dataset."""
+    out: Path
+    """Folder of the runs, the table (ablation.md, ablation.json) and the figure."""
+    rows: tuple[str, ...] = tuple(ROWS)
+    """Which rows of the table."""
+    seeds: int = 1
+    """Runs of each row, with seeds from 0."""
+    preset: str = "nerf"
+    """Scale of the model: nerf, or paper for the published one."""
+    max_seconds: float | None = None
+    """Training time of each run (default 300 if --steps is not given)."""
+    steps: int | None = None
+    """Training steps of each run."""
+    downscale: int = 1
+    """Average images over blocks of K×K pixels."""
+    split: str = "test"
+    """Views to evaluate on."""
+    views: int | None = None
+    """Only so many of them, evenly spread."""
+    set: UseAppendAction[tuple[str, ...]] = ()
+    """Change any setting of all rows: key=value; repeatable."""
+    variant: Variant = None
+
+    def run(self, _started: float) -> None:
+        """Trains and evaluates all rows."""
+        config = with_settings(preset(self.preset), list(self.set))
+        config = replace(config, downscale=positive("downscale", self.downscale))
+        if self.steps is None:
+            seconds = 300.0 if self.max_seconds is None else self.max_seconds
+            config = replace(config, max_seconds=positive("max-seconds", seconds))
+        else:
+            config = replace(config, steps=positive("steps", self.steps))
+        if self.views is not None:
+            positive("views", self.views)
+        record = ablate(
+            self.data,
+            self.out,
+            config,
+            choose_variant(self.variant),
+            rows=self.rows,
+            seeds=positive("seeds", self.seeds),
+            split=self.split,
+            views=self.views,
+        )
+        print(table(record))
+        if not record["complete"]:
+            print(f"{self.out}: interrupted, the same command goes on")
+            raise KeyboardInterrupt
