@@ -44,7 +44,7 @@ def complete(config: TrainConfig) -> TrainConfig:
         position=FourierEncoding(frequencies=10),
         direction=FourierEncoding(frequencies=4),
         occupancy=replace(config.occupancy, enabled=False),
-        sampling=sampling,
+        sampling=replace(sampling, hidden=0.0, render_stop=0.0),
     )
 
 

@@ -49,8 +49,17 @@ def _aligned(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
 
 def vector3_type(float_type: type) -> Any:
     """The 3-vector of ``float_type``, e.g. ``drjit.llvm.ad.Array3f``."""
+    return _array("Array3", float_type)
+
+
+def array_type(float_type: type) -> Any:
+    """The array of any number of ``float_type``, e.g. ``drjit.llvm.ad.ArrayXf``."""
+    return _array("ArrayX", float_type)
+
+
+def _array(kind: str, float_type: type) -> Any:
     suffix = "f64" if dr.type_v(float_type) == dr.VarType.Float64 else "f"
-    return getattr(sys.modules[float_type.__module__], "Array3" + suffix)
+    return getattr(sys.modules[float_type.__module__], kind + suffix)
 
 
 def gather_vector3(source: Any, index: Any) -> Any:

@@ -14,6 +14,8 @@ from typing import Any, Literal
 
 import drjit as dr
 
+from .arrays import array_type
+
 Convention = Literal["pi", "one", "two_pi"]
 
 # 2π as a sum of three floats of decreasing size, for Cody-Waite reduction.
@@ -75,13 +77,43 @@ def sincos_octave(x: Any, k: int, convention: Convention) -> tuple[Any, Any]:
     return dr.sincos(reduced * math.pi)
 
 
+class _StackRows(dr.CustomOp):
+    """Arrays as the rows of a tensor.
+
+    The adjoint of a scatter also clears what it overwrites, row by row in kernels of their
+    own; here every row is written once, and a gather is all that is needed.
+    """
+
+    def eval(self, rows: list[Any]) -> Any:
+        """F arrays of N values, or of one, as an ``(F, N)`` tensor."""
+        float_type = type(rows[0])
+        self._sizes = [len(row) for row in rows]
+        count = max(self._sizes)
+        uint = dr.uint32_array_t(float_type)
+        self._column, self._stride = dr.arange(uint, count), dr.opaque(uint, count)
+        flat = dr.ravel(array_type(float_type)(rows), order="C")
+        return dr.tensor_t(float_type)(flat, shape=(len(rows), count))
+
+    def forward(self) -> None:
+        """The tangents, stacked likewise."""
+        self.set_grad_out(_StackRows().eval(self.grad_in("rows")))
+
+    def backward(self) -> None:
+        """The rows of the gradient."""
+        gradient = self.grad_out().array
+        rows = [
+            dr.gather(type(gradient), gradient, self._column + self._stride * i)
+            for i in range(len(self._sizes))
+        ]
+        single = [n == 1 and len(row) > 1 for n, row in zip(self._sizes, rows, strict=True)]
+        rows = [dr.sum(row) if one else row for one, row in zip(single, rows, strict=True)]
+        self.set_grad_in("rows", rows)
+
+    def name(self) -> str:
+        """Shown in Dr.Jit's graphs."""
+        return "StackRows"
+
+
 def stack_rows(rows: list[Any]) -> Any:
     """Writes F arrays of N values into one ``(F, N)`` tensor, in a single kernel."""
-    float_type = type(rows[0])
-    count = max(len(row) for row in rows)
-    uint = dr.uint32_array_t(float_type)
-    column, stride = dr.arange(uint, count), dr.opaque(uint, count)
-    buffer = dr.empty(float_type, len(rows) * count)
-    for i, row in enumerate(rows):
-        dr.scatter(buffer, row, column + stride * i)
-    return dr.tensor_t(float_type)(buffer, shape=(len(rows), count))
+    return dr.custom(_StackRows, rows)

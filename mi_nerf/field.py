@@ -13,7 +13,8 @@ import numpy as np
 from . import network
 from .activations import ColorActivation, DensityActivation, apply_activation
 from .arrays import upload, vector3_type
-from .encoding import FourierEncoding
+from .encoding import FourierEncoding, stack_rows
+from .hash_grid import HashGrid, HashGridConfig
 from .ndc import Ndc
 from .network import NetworkConfig
 
@@ -49,12 +50,13 @@ class Field(Protocol):
 
 @dataclass(frozen=True)
 class NeuralFieldConfig:
-    """Everything that describes a Fourier-feature field, apart from its weights."""
+    """Everything that describes a neural field, apart from its weights."""
 
     lower: Corner = (-1.0, -1.0, -1.0)  # the box, in scene units
     upper: Corner = (1.0, 1.0, 1.0)
     color_space: ColorSpace = "srgb"
     position: FourierEncoding = field(default_factory=FourierEncoding)
+    grid: HashGridConfig | None = None  # trained features of the position, besides the others
     direction: FourierEncoding = field(default_factory=lambda: FourierEncoding(frequencies=4))
     network: NetworkConfig = field(default_factory=NetworkConfig)
     density_activation: DensityActivation = "softplus"
@@ -76,9 +78,17 @@ class NeuralFieldConfig:
             if value not in choices:
                 raise ValueError(f"{name}={value!r}, expected one of {', '.join(choices)}")
 
+    @property
+    def position_size(self) -> int:
+        """Number of features of a position."""
+        return self.position.size + (0 if self.grid is None else self.grid.size)
+
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Names and shapes of the network's parameters."""
-        return self.network.shapes(self.position.size, self.direction.size)
+        """Names and shapes of all parameters."""
+        shapes = self.network.shapes(self.position_size, self.direction.size)
+        if self.grid is not None:
+            shapes[network.GRID] = (self.grid.entries(), self.grid.features)
+        return shapes
 
     def parameter_count(self) -> int:
         """Number of trainable scalars."""
@@ -136,7 +146,7 @@ def _scramble(x: Any) -> Any:
 
 
 class NeuralField:
-    """Fourier features into an MLP (NeRF Sec. 4 and 5.1), behind the Field protocol."""
+    """Features of position and direction into an MLP (NeRF Sec. 4 and 5.1)."""
 
     coarse: NeuralField | None = None  # says where this one is worth sampling (Sec. 5.2)
     noise: DensityNoise | None = None  # added to raw densities, in training
@@ -164,6 +174,9 @@ class NeuralField:
             if weights[name].shape != shape:
                 raise ValueError(f"tensor '{name}' is {weights[name].shape}, expected {shape}")
         self._weights = {name: upload(tensor_type, weights[name]) for name in shapes}
+        self._grid = None
+        if config.grid is not None:
+            self._grid = HashGrid(config.grid, type(self._weights[network.GRID].array))
 
     @classmethod
     def create(cls, config: NeuralFieldConfig, seed: int, tensor_type: Any) -> NeuralField:
@@ -195,7 +208,10 @@ class NeuralField:
         unit = vector3_type(type(p[0]))(
             *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
         )
-        return network.trunk(config.network, self._weights, config.position(unit))
+        features = config.position.features(unit)
+        if self._grid is not None:
+            features += self._grid.features(unit, self._weights[network.GRID])
+        return network.trunk(config.network, self._weights, stack_rows(features))
 
     def _density(self, h: Any, p: Any) -> Any:
         config = self.config

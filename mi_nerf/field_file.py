@@ -12,10 +12,11 @@ import numpy as np
 from .encoding import FourierEncoding
 from .errors import InputError
 from .field import NeuralField, NeuralFieldConfig
+from .hash_grid import HashGridConfig
 from .ndc import Ndc
 from .network import NetworkConfig
 from .occupancy import OccupancyGrid
-from .tensor_file import Arrays, read_tensors, write_tensors
+from .tensor_file import Arrays, prefixed, read_tensors, write_tensors
 from .volume import MarchSettings
 
 VERSION = 1
@@ -54,9 +55,9 @@ def save_field(path: str | Path, contents: FieldFile) -> None:
         arrays |= {f"coarse.{name}": array for name, array in contents.coarse.items()}
     if contents.occupancy is not None:
         arrays["occupancy"] = np.packbits(contents.occupancy)
-    march = {k: getattr(contents.march, k) for k in ("samples", "fine", "near", "far")}
+    march = {k: getattr(contents.march, k) for k in ("samples", "fine", "near", "far", "stop")}
     description = {
-        "field": {"kind": "fourier", **dataclasses.asdict(contents.config)},
+        "field": {"kind": "neural", **dataclasses.asdict(contents.config)},
         "density_unit": "1/scene unit",
         "occupancy_shape": None if contents.occupancy is None else contents.occupancy.shape,
         "march": march,
@@ -75,7 +76,7 @@ def load_field(path: str | Path) -> FieldFile:
     arrays, description = read_tensors(path, kind="field", version=VERSION)
     try:
         config = _field_config(description["field"])
-        weights, coarse = _prefixed(arrays, "weights."), _prefixed(arrays, "coarse.")
+        weights, coarse = prefixed(arrays, "weights."), prefixed(arrays, "coarse.")
         occupancy = None
         if description["occupancy_shape"] is not None:
             occupancy = _unpack(arrays["occupancy"], tuple(description["occupancy_shape"]))
@@ -93,11 +94,6 @@ def load_field(path: str | Path) -> FieldFile:
     return contents
 
 
-def _prefixed(arrays: Arrays, prefix: str) -> Arrays:
-    """The arrays whose names begin with ``prefix``, without it."""
-    return {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
-
-
 def _unpack(packed: np.ndarray[Any, Any], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
     """(X, Y, Z) booleans from eight to a byte; NumPy would fill up what is missing."""
     count = int(np.prod(shape))
@@ -108,13 +104,15 @@ def _unpack(packed: np.ndarray[Any, Any], shape: tuple[int, ...]) -> np.ndarray[
 
 def _field_config(data: dict[str, Any]) -> NeuralFieldConfig:
     values = dict(data)
-    if (kind := values.pop("kind")) != "fourier":
-        raise ValueError(f"field kind '{kind}', expected 'fourier'")
+    if (kind := values.pop("kind")) not in ("neural", "fourier"):  # the first one's old name
+        raise ValueError(f"field kind '{kind}', expected 'neural'")
     for name in ("lower", "upper", "input_center"):
         values[name] = tuple(values[name])
     for name in ("position", "direction"):
         values[name] = FourierEncoding(**values[name])
     values["network"] = NetworkConfig(**values["network"])
+    if values.get("grid") is not None:  # files of Fourier fields may not mention it
+        values["grid"] = HashGridConfig(**values["grid"])
     if values.get("ndc") is not None:  # files of fields in scene space may not mention it
         values["ndc"] = Ndc(**values["ndc"])
     return NeuralFieldConfig(**values)

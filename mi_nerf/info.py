@@ -16,6 +16,7 @@ from .errors import InputError
 from .field_file import FieldFile, load_field
 from .files import read_json
 from .generation.run import RECORD, ceilings
+from .hash_grid import HashGridConfig
 from .tensor_file import read_metadata, read_tensors
 from .training import checkpoint
 from .training.run import CHECKPOINT, CONFIG, FIELD, read_config
@@ -105,6 +106,7 @@ def _field_rows(path: Path, contents: FieldFile) -> dict[str, str]:
         f"{net.view_depth}x{net.view_width}, {config.parameter_count()} parameters",
         "encoding": f"L={config.position.frequencies} (position), "
         f"{config.direction.frequencies} (direction), convention {config.position.convention}",
+        **({} if config.grid is None else {"hash grid": _grid(config.grid)}),
         "density": f"{config.density_activation}, scale {config.density_scale:.4g} 1/scene unit",
         "colour": f"{config.color_activation}, {config.color_space}",
         "box": f"{_corner(config.lower)} to {_corner(config.upper)}"
@@ -112,6 +114,13 @@ def _field_rows(path: Path, contents: FieldFile) -> dict[str, str]:
         "sampling": f"{march.samples} strata a ray, near {march.near}, far {march.far}",
         "occupied": "no grid" if filled is None else f"{filled.mean():.1%} of {filled.shape}",
     }
+
+
+def _grid(grid: HashGridConfig) -> str:
+    return (
+        f"{grid.levels} levels of {grid.coarsest} to {grid.finest} vertices, {grid.features} "
+        f"features, at most 2^{grid.log2_entries} entries a level"
+    )
 
 
 def _dataset(folder: Path) -> str:

@@ -20,6 +20,9 @@ import numpy as np
 
 from .activations import relu
 
+GRID = "grid.table"  # the parameter that holds the features of a hash grid
+_GRID_START = 1e-4  # its entries start within plus or minus this (Müller et al. 2022)
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
@@ -77,11 +80,17 @@ class NetworkConfig:
 def initial_weights(
     shapes: dict[str, tuple[int, ...]], seed: int
 ) -> dict[str, np.ndarray[Any, Any]]:
-    """He-normal weights for ReLU layers, Glorot-normal for linear ones, zero biases."""
+    """He-normal weights for ReLU layers, Glorot-normal for linear ones, zero biases.
+
+    Entries of a hash grid start near 0.
+    """
     rng = np.random.default_rng(seed)
     result = {}
     for name, shape in shapes.items():
         layer, kind = name.split(".")
+        if name == GRID:
+            result[name] = rng.uniform(-_GRID_START, _GRID_START, shape).astype(np.float32)
+            continue
         if kind == "bias":
             result[name] = np.zeros(shape, np.float32)
             continue

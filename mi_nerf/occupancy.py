@@ -3,10 +3,14 @@
 Samples in cells marked empty are not evaluated and count as density 0. A cell is only
 marked empty while its optical thickness, as last seen, stays below a threshold: a ray
 that crosses n such cells loses an opacity of about n · threshold at most.
+
+During training the grid also knows a density that each cell has everywhere, as far as
+seen: samples behind much of that are hidden and need no evaluation either.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import drjit as dr
@@ -18,9 +22,12 @@ from .field import Corner, Field
 # Value of a cell that was never looked at: occupied whatever the threshold.
 _UNSEEN = np.float32(np.finfo(np.float32).max)
 
+# The least density of a cell follows a smaller one at once, a larger one by this share a look.
+_FLOOR_RISE = 0.1
+
 
 class OccupancyGrid:
-    """Cells of an axis-aligned box, each with a decaying maximum of its density."""
+    """Cells of an axis-aligned box, each with a decaying maximum and a floor of its density."""
 
     def __init__(
         self, lower: Corner, upper: Corner, cells: np.ndarray[Any, Any], float_type: Any
@@ -37,6 +44,7 @@ class OccupancyGrid:
         self._float, self._uint = float_type, dr.uint32_array_t(float_type)
         self._candidates = upload(self._uint, np.flatnonzero(cells).astype(np.uint32))
         self._values = upload(float_type, np.where(cells.ravel(), _UNSEEN, 0))
+        self._floor = dr.zeros(float_type, cells.size)
         self._hull = self._mask = self._upload_mask(cells)
 
     @property
@@ -52,19 +60,30 @@ class OccupancyGrid:
         """(X, Y, Z) remembered densities, 1/scene unit."""
         return np.array(self._values).reshape(self.shape)
 
+    def floor(self) -> np.ndarray[Any, Any]:
+        """(X, Y, Z) densities below which the cells have seldom been seen, 1/scene unit."""
+        return np.array(self._floor).reshape(self.shape)
+
     def fraction(self) -> float:
         """Share of the cells that are sampled."""
         return float(dr.count(self._mask)[0]) / len(self._mask)
 
-    def occupied(self, p: Any) -> Any:
-        """Whether points (in field coordinates) lie in cells that may hold something."""
+    def cell(self, p: Any) -> Any:
+        """Numbers of the cells in which points (in field coordinates) lie."""
         index = self._uint(0)
         for i, size in enumerate(self.cell_size):
             last = self.shape[i] - 1
-            cell = dr.floor((p[i] - float(self.lower[i])) * float(1 / size))
-            cell = self._uint(dr.fmin(dr.fmax(cell, 0), float(last)))
-            index = index * self.shape[i] + cell
-        return dr.gather(dr.mask_t(self._float), self._mask, index)
+            along = dr.floor((p[i] - float(self.lower[i])) * float(1 / size))
+            index = index * self.shape[i] + self._uint(dr.fmin(dr.fmax(along, 0), float(last)))
+        return index
+
+    def occupied(self, cell: Any) -> Any:
+        """Whether cells may hold something."""
+        return dr.gather(dr.mask_t(self._float), self._mask, cell)
+
+    def least_density(self, cell: Any) -> Any:
+        """What light meets everywhere in these cells, as far as seen; 1/scene unit."""
+        return dr.gather(self._float, self._floor, cell)
 
     def refresh(
         self, field: Field, rng: Any, turn: int, *, queries: int, threshold: float, decay: float
@@ -90,16 +109,23 @@ class OccupancyGrid:
         self._mask = self._hull & dense
         dr.eval(self._mask, self._values)
 
-    def restore(self, values: np.ndarray[Any, Any], mask: np.ndarray[Any, Any]) -> None:
-        """Takes up the state of a grid of the same shape.
+    def state(self) -> dict[str, np.ndarray[Any, Any]]:
+        """All that :meth:`restore` needs, by name."""
+        return {"values": self.values(), "floor": self.floor(), "mask": self.mask()}
+
+    def restore(self, state: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Takes up the :meth:`state` of a grid of the same shape.
 
         Raises:
+            KeyError: if an array is missing.
             ValueError: if the shape is another.
         """
-        for array in (values, mask):
+        values, floor, mask = (state[name] for name in ("values", "floor", "mask"))
+        for array in (values, floor, mask):
             if array.shape != self.shape:
                 raise ValueError(f"occupancy grid is {array.shape}, expected {self.shape}")
         self._values = upload(self._float, np.asarray(values, np.float32).ravel())
+        self._floor = upload(self._float, np.asarray(floor, np.float32).ravel())
         self._mask = self._upload_mask(mask)
 
     def _upload_mask(self, cells: np.ndarray[Any, Any]) -> Any:
@@ -111,8 +137,11 @@ class OccupancyGrid:
         self, field: Field, pool: Any, first: int, count: int, rng: Any, decay: float
     ) -> None:
         uint = self._uint
-        turn = dr.arange(uint, count) + dr.opaque(uint, first % len(pool))
-        cell = dr.gather(uint, pool, turn % dr.opaque(uint, len(pool)))
+        slot = dr.arange(uint, count)
+        new = slot < dr.opaque(uint, len(pool))  # each cell once, in however small a pool
+        cell = dr.gather(
+            uint, pool, (slot + dr.opaque(uint, first % len(pool))) % dr.opaque(uint, len(pool))
+        )
         rest = cell
         where: list[Any] = []
         for size in reversed(self.shape):
@@ -129,11 +158,11 @@ class OccupancyGrid:
             density = field.density(p)
             old = dr.gather(self._float, self._values, cell)
             old = dr.select(old < float(_UNSEEN), old * decay, 0)
-            # A pool smaller than the batch is gone through more than once.
-            dr.scatter(self._values, old, cell)
-            dr.eval(self._values)  # a store and a reduction fused into one kernel lose the store
-            dr.scatter_reduce(dr.ReduceOp.Max, self._values, density, cell)
-            dr.eval(self._values)
+            floor = dr.gather(self._float, self._floor, cell)
+            risen = floor + _FLOOR_RISE * (density - floor)
+            dr.scatter(self._values, dr.fmax(old, density), cell, new)
+            dr.scatter(self._floor, dr.fmin(risen, density), cell, new)
+            dr.eval(self._values, self._floor)
 
 
 def grid_shape(lower: Corner, upper: Corner, resolution: int) -> tuple[int, int, int]:

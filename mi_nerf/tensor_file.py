@@ -59,6 +59,11 @@ def read_tensors(path: str | Path, *, kind: str, version: int) -> tuple[Arrays, 
     return arrays, description
 
 
+def prefixed(arrays: Arrays, prefix: str) -> Arrays:
+    """The arrays whose names begin with ``prefix``, without it."""
+    return {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
+
+
 def read_metadata(path: str | Path) -> dict[str, str]:
     """The metadata of any safetensors file.
 

@@ -2,7 +2,7 @@
 
     rays → (normalised device coordinates) → interval in the box → strata
          → (cells that may hold something) → (where the coarse network sees something)
-         → field, in blocks of constant size → quadrature
+         → field, in blocks of constant size, front to back → quadrature
 
 The field sees its queries in blocks of a constant number of columns, so tensor-mode
 kernels are compiled once whatever the number of samples a ray batch needs. The
@@ -12,7 +12,9 @@ block, which is what bounds the memory of a gradient.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -33,6 +35,12 @@ from .sampling import (
     stratified,
 )
 
+# Samples of each ray that are evaluated before it is first asked whether the ray goes on.
+_FIRST_ROUND = 4
+
+# Numbers in the copies of a gradient that threads may have for themselves, together.
+_PRIVATE_NUMBERS = 1 << 26
+
 
 @dataclass(frozen=True)
 class MarchSettings:
@@ -42,15 +50,20 @@ class MarchSettings:
     fine: int = 0  # samples more, placed by the field's coarse network, if it has one
     near: float | None = None  # lower bound of t, in scene units; None: the box alone
     far: float | None = None  # upper bound of t
+    stop: float = 0.0  # a ray ends where less than this share of light passes; 0: never
+    hidden: float = 0.0  # optical depth by the occupancy's floor that hides a sample; 0: none
     block: int = 16384  # queries a network evaluation
-    chunk: int = 1 << 20  # samples placed at a time in primal rendering
+    chunk: int = 1 << 21  # samples placed at a time in primal rendering
 
     def __post_init__(self) -> None:
         for name in ("samples", "block", "chunk"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}, expected at least 1")
-        if self.fine < 0:
-            raise ValueError(f"fine={self.fine}, expected 0 or more")
+        for name in ("fine", "hidden"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}={getattr(self, name)}, expected 0 or more")
+        if not 0 <= self.stop < 1:
+            raise ValueError(f"stop={self.stop}, expected 0 to less than 1")
         if self.near is not None and self.far is not None and not self.near < self.far:
             raise ValueError(f"near={self.near} must be smaller than far={self.far}")
 
@@ -81,15 +94,16 @@ class Samples:
         """M."""
         return len(self.index)
 
-    def truncate(self, budget: int) -> int:
+    def truncate(self, budget: int) -> Any:
         """Keeps the first ``budget`` queries; returns how many rays keep all of theirs.
 
-        Rays from that number on are incomplete and must be left out of a loss.
+        Rays from that number on are incomplete and must be left out of a loss. The number
+        is an array of one element, which the host need not wait for.
         """
-        if self.queries <= budget:
-            return self.rays
         uint = type(self.index)
-        first_lost = int(self.index[budget])
+        if self.queries <= budget:
+            return dr.opaque(uint, self.rays)
+        first_lost = dr.gather(uint, self.index, dr.opaque(uint, budget))
         self.index = dr.gather(uint, self.index, dr.arange(uint, budget))
         return first_lost // self.count
 
@@ -124,13 +138,14 @@ def place_samples(
             near, far, hit = clip_interval(near, far, hit, *limit)
         t, delta = stratified(near, far, settings.samples, jitter)
         samples = Samples(o, d, view, t, delta, settings.samples, near, far, ndc=ndc)
-        samples = _select(samples, hit, occupancy)
+        samples = _select(samples, hit, occupancy, settings.hidden)
         coarse = getattr(field, "coarse", None)
         if coarse is None or not settings.fine:
             return samples
-        evaluation = Evaluation(coarse, samples, settings.block)
+        evaluation = Evaluation(coarse, samples, settings.block, stop=settings.stop)
         weights, _ = sample_weights(evaluation.density, delta, settings.samples)
         shift = jitter if jitter is not None and len(jitter) == samples.rays else None
+        samples.index = evaluation.asked
         return refine(samples, weights, settings.fine, occupancy, shift)
 
 
@@ -140,6 +155,7 @@ def refine(
     fine: int,
     occupancy: OccupancyGrid | None = None,
     jitter: Any = None,
+    hidden: float = 0.0,
 ) -> Samples:
     """Adds ``fine`` samples a ray where ``weights`` are large (NeRF Sec. 5.2).
 
@@ -148,6 +164,7 @@ def refine(
         weights: theirs; without gradient.
         jitter: R·F numbers in [0, 1), or R to shift all of a ray alike; ``None`` for the
             middle of the strata of the cumulative distribution.
+        hidden: as in :class:`MarchSettings`.
     """
     with dr.suspend_grad():
         near, far, count = samples.near, samples.far, samples.count
@@ -157,18 +174,23 @@ def refine(
         merged = replace(
             samples, t=t, delta=delta, count=count + fine, coarse_queries=samples.queries
         )
-        return _select(merged, far > near, occupancy)
+        return _select(merged, far > near, occupancy, hidden)
 
 
-def _select(samples: Samples, hit: Any, occupancy: OccupancyGrid | None) -> Samples:
-    """Keeps for evaluation the samples that may lie in something."""
+def _select(samples: Samples, hit: Any, occupancy: OccupancyGrid | None, hidden: float) -> Samples:
+    """Keeps for evaluation the samples that may lie in something, and may be seen."""
     dr.eval(samples.t, samples.delta, samples.near, samples.far)
     t = samples.t
     uint = dr.uint32_array_t(type(t))
     ray = dr.arange(uint, len(t)) // samples.count
     wanted = dr.gather(dr.mask_t(type(t)), hit, ray)
     if occupancy is not None:
-        wanted &= occupancy.occupied(points_along(samples.o, samples.d, t, ray))
+        cell = occupancy.cell(points_along(samples.o, samples.d, t, ray))
+        wanted &= occupancy.occupied(cell)
+        if hidden > 0:
+            tau = dr.select(wanted, occupancy.least_density(cell) * samples.delta, 0)
+            before = dr.block_prefix_sum(tau, samples.count, exclusive=True)
+            wanted &= before < dr.opaque(type(t), hidden)
     samples.index = uint(dr.compress(wanted))
     return samples
 
@@ -179,16 +201,39 @@ class Evaluation:
     ``density`` and ``emission`` are R·S arrays without history. To differentiate,
     enable their gradients, differentiate what was made of them, then call
     :meth:`backward`: it carries their gradients into the field's parameters.
+
+    With ``stop``, the samples of a ray are evaluated front to back in rounds, and those
+    behind a transmittance below ``stop`` not at all. They would have added less than
+    ``stop`` to the opacity, and less than ``stop`` times the largest emission behind them
+    to a colour.
     """
 
-    def __init__(self, field: Field, samples: Samples, block: int, *, keep: bool = False) -> None:
+    def __init__(
+        self,
+        field: Field,
+        samples: Samples,
+        block: int,
+        *,
+        keep: bool = False,
+        stop: float = 0.0,
+    ) -> None:
         """Evaluates the field; with ``keep``, activations stay for :meth:`backward`."""
         self._field, self._samples, self._block = field, samples, block
         self._graph: list[tuple[Any, Any, list[Any]]] = []
         float_type = type(samples.t)
         self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4)]
         dr.make_opaque(self._channels)  # without queries they would stay constants
-        for where, valid in self._blocks():
+        if stop <= 0:
+            self.asked = samples.index
+            self._evaluate(samples.index, keep)
+            return
+        rounds = [self._evaluate(index, keep) for index in self._front_to_back(stop)]
+        uint = type(samples.index)
+        self.asked = dr.concat(rounds) if rounds else dr.zeros(uint, 0)
+
+    def _evaluate(self, index: Any, keep: bool) -> Any:
+        """Fills in the samples ``index``, and returns it."""
+        for where, valid in self._blocks(index):
             if keep:
                 outputs = self._query(where)
                 self._graph.append((where, valid, outputs))
@@ -198,6 +243,31 @@ class Evaluation:
             for channel, value in zip(self._channels, outputs, strict=True):
                 dr.scatter(channel, dr.detach(value), where, valid)
             dr.eval(self._channels, outputs)
+        return index
+
+    def _front_to_back(self, stop: float) -> Iterator[Any]:
+        """Indices of the samples to ask for next, as long as any ray goes on.
+
+        Each round looks at twice as many samples of every ray as the one before.
+        """
+        samples, float_type = self._samples, type(self._samples.t)
+        uint = type(samples.index)
+        pending = samples.index
+        limit = dr.opaque(float_type, -math.log(stop))
+        rank = _rank_in_ray(pending // samples.count, samples.rays)
+        size, start = _FIRST_ROUND, 0
+        while len(pending):
+            turn = rank < dr.opaque(uint, start + size)
+            chosen, later = dr.compress(turn), dr.compress(~turn)
+            yield dr.gather(uint, pending, chosen)
+            pending, rank = (dr.gather(uint, v, later) for v in (pending, rank))
+            start, size = start + size, 2 * size
+            if not len(pending):
+                return
+            depth = dr.block_sum(self.density * samples.delta, samples.count)
+            alive = dr.compress(dr.gather(float_type, depth, pending // samples.count) < limit)
+            pending, rank = (dr.gather(uint, v, alive) for v in (pending, rank))
+            dr.eval(pending, rank)
 
     @property
     def density(self) -> Any:
@@ -218,22 +288,23 @@ class Evaluation:
         """Propagates the gradients of density and emission to the parameters."""
         gradients = [dr.grad(channel) for channel in self._channels]
         dr.eval(gradients)
-        kept = self._graph or ((w, v, None) for w, v in self._blocks())
-        for where, valid, outputs in kept:
-            outputs = outputs or self._query(where)
-            for value, gradient in zip(outputs, gradients, strict=True):
-                if dr.grad_enabled(value):
-                    # Added up: a grey field may return one array for all channels.
-                    dr.accum_grad(value, dr.gather(type(value), gradient, where, valid))
-                    dr.enqueue(dr.ADMode.Backward, value)
-            dr.traverse(dr.ADMode.Backward)
-            dr.eval([dr.grad(p) for p in self._field.parameters().values()])
+        kept = self._graph or ((w, v, None) for w, v in self._blocks(self.asked))
+        with _private_sums():
+            for where, valid, outputs in kept:
+                outputs = outputs or self._query(where)
+                for value, gradient in zip(outputs, gradients, strict=True):
+                    if dr.grad_enabled(value):
+                        # Added up: a grey field may return one array for all channels.
+                        dr.accum_grad(value, dr.gather(type(value), gradient, where, valid))
+                        dr.enqueue(dr.ADMode.Backward, value)
+                dr.traverse(dr.ADMode.Backward)
+                dr.eval([dr.grad(p) for p in self._field.parameters().values()])
         self._graph = []
 
     def forward(self) -> None:
         """Fills the gradients of density and emission from those of the parameters."""
         tangents = [dr.zeros(type(c), len(c)) for c in self._channels]
-        for where, valid in self._blocks():
+        for where, valid in self._blocks(self.asked):
             outputs = self._query(where)
             # One output may be computed from another: keep the tangents of all.
             dr.forward_to(outputs, flags=dr.ADFlag.ClearNone)
@@ -243,14 +314,13 @@ class Evaluation:
         for channel, tangent in zip(self._channels, tangents, strict=True):
             dr.set_grad(channel, tangent)
 
-    def _blocks(self) -> Iterator[tuple[Any, Any]]:
+    def _blocks(self, index: Any) -> Iterator[tuple[Any, Any]]:
         """Sample numbers and validity of each block; the last one is padded."""
-        samples = self._samples
-        uint = type(samples.index)
-        for start in range(0, samples.queries, self._block):
+        uint = type(index)
+        for start in range(0, len(index), self._block):
             slot = dr.arange(uint, self._block) + dr.opaque(uint, start)
-            valid = slot < dr.opaque(uint, samples.queries)
-            where = dr.gather(uint, samples.index, slot, valid)
+            valid = slot < dr.opaque(uint, len(index))
+            where = dr.gather(uint, index, slot, valid)
             dr.eval(where, valid)
             yield where, valid
 
@@ -261,6 +331,31 @@ class Evaluation:
         p = points_along(samples.o, samples.d, t, ray)
         density, emission = self._field.density_emission(p, gather_vector3(samples.view, ray))
         return [density, *emission]
+
+
+@contextmanager
+def _private_sums() -> Iterator[None]:
+    """Lets every thread add up the gradient of a table on its own, unless that is too large.
+
+    On the CPU, adding to the entries of a hash grid atomically takes several times longer.
+    """
+    before = dr.expand_threshold()
+    dr.set_expand_threshold(_PRIVATE_NUMBERS // max(1, dr.thread_count()))
+    try:
+        yield
+    finally:
+        dr.set_expand_threshold(before)
+
+
+def _rank_in_ray(ray: Any, rays: int) -> Any:
+    """How many samples of the same ray come before each one; ``ray`` ascends."""
+    uint = type(ray)
+    place = dr.arange(uint, len(ray))
+    first = dr.full(uint, len(ray), rays)
+    dr.scatter_reduce(dr.ReduceOp.Min, first, place, ray)
+    rank = place - dr.gather(uint, first, ray)
+    dr.eval(rank)
+    return rank
 
 
 def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
@@ -321,12 +416,13 @@ def render_rays(
             samples = place_samples(
                 field, chunk_o, chunk_d, settings, occupancy=occupancy, jitter=offset
             )
-            result = integrate(Evaluation(field, samples, settings.block), samples)
+            evaluation = Evaluation(field, samples, settings.block, stop=settings.stop)
+            result = integrate(evaluation, samples)
             values = [*result.color, result.opacity, result.depth]
             for output, value in zip(outputs, values, strict=True):
                 dr.scatter(output, value, index)
             dr.eval(outputs)
-            queries += samples.queries + samples.coarse_queries
+            queries += len(evaluation.asked) + samples.coarse_queries
     return RayImage(outputs[:3], outputs[3], outputs[4], queries)
 
 

@@ -453,7 +453,7 @@ RUN_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "other version": (
         lambda r: change_tensors(r / "checkpoint.safetensors", lambda m, _: m.update(version="99")),
-        "checkpoint file of version 99, this mi_nerf reads version 1",
+        "checkpoint file of version 99, this mi_nerf reads version 2",
     ),
     "other kind": (
         lambda r: shutil.copy(r / "field.safetensors", r / "checkpoint.safetensors"),
@@ -508,7 +508,7 @@ FIELD_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "unknown field": (
         lambda f: change_description(f, lambda d: d["field"].update(kind="hash")),
-        "field kind 'hash', expected 'fourier'",
+        "field kind 'hash', expected 'neural'",
     ),
     "box upside down": (
         lambda f: change_description(f, lambda d: d["field"].update(lower=[9, 9, 9])),

@@ -56,7 +56,9 @@ def test_lookup_on_faces_and_outside(ad: Any) -> None:
     ticks = np.array([-1.5, -1.125, -1, -0.5, -0.25, 0, 0.125, 0.5, 0.75, 1, 1.125, 9])
     p = np.stack(np.meshgrid(ticks, ticks, ticks, indexing="ij"), -1).reshape(-1, 3)
     grid = OccupancyGrid(LOWER, UPPER, mask, ad.Float)
-    assert np.array_equal(grid.occupied(vectors(ad, p)), slow_occupied(mask, LOWER, UPPER, p))
+    assert np.array_equal(
+        grid.occupied(grid.cell(vectors(ad, p))), slow_occupied(mask, LOWER, UPPER, p)
+    )
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
@@ -68,12 +70,15 @@ def test_lookup_at_random_points(ad: Any, scale: float) -> None:
     share = share[(np.abs(share - np.rint(share)) > 1e-4).all(axis=1)]  # off the faces
     p = (lower + share / mask.shape * (np.array(upper) - lower)).astype(np.float32)
     grid = OccupancyGrid(lower, upper, mask, ad.Float)
-    assert np.array_equal(grid.occupied(vectors(ad, p)), slow_occupied(mask, lower, upper, p))
+    assert np.array_equal(
+        grid.occupied(grid.cell(vectors(ad, p))), slow_occupied(mask, lower, upper, p)
+    )
 
 
 def test_infinite_and_invalid_points_stay_within_the_grid(ad: Any) -> None:
     p = [(np.nan, 0, 0), (np.inf, 0, 0), (0, -np.inf, 0), (3e38, -3e38, 1e30)]
-    assert np.array(full_grid(ad).occupied(vectors(ad, p))).all()
+    grid = full_grid(ad)
+    assert np.array(grid.occupied(grid.cell(vectors(ad, p)))).all()
 
 
 def test_contents(ad: Any) -> None:
@@ -89,7 +94,7 @@ def test_the_given_array_may_change_afterwards(ad: Any) -> None:
     cells, saved = np.ones((16, 16, 16), bool), np.ones((16, 16, 16), bool)
     grid = OccupancyGrid(LOWER, UPPER, cells, ad.Float)
     restored = full_grid(ad, cells.shape)
-    restored.restore(grid.values(), saved)
+    restored.restore({**grid.state(), "mask": saved})
     cells[:] = saved[:] = False
     assert grid.fraction() == restored.fraction() == 1
 
@@ -188,7 +193,7 @@ def test_no_candidates_at_all(ad: Any) -> None:
     field = AnalyticField(uniform(9.0))
     refresh(ad, grid, field, 2)
     assert grid.fraction() == 0 and field.asked == 0
-    assert not np.array(grid.occupied(vectors(ad, [(0.5, 0, 0)]))).any()
+    assert not np.array(grid.occupied(grid.cell(vectors(ad, [(0.5, 0, 0)])))).any()
 
 
 def test_long_and_short_cells(ad: Any) -> None:
@@ -210,10 +215,11 @@ def test_restore(ad: Any) -> None:
     field = AnalyticField(ball(0.6, 50.0))
     first, second = full_grid(ad), full_grid(ad)
     refresh(ad, first, field, 3)
-    second.restore(first.values(), first.mask())
+    second.restore(first.state())
     for _ in range(2):
         assert np.array_equal(first.mask(), second.mask())
         assert np.array_equal(first.values(), second.values())
+        assert np.array_equal(first.floor(), second.floor())
         refresh(ad, first, field, first=3)
         refresh(ad, second, field, first=3)
 
@@ -221,9 +227,11 @@ def test_restore(ad: Any) -> None:
 def test_restore_refuses_another_shape(ad: Any) -> None:
     grid, other = full_grid(ad, (4, 4, 4)), full_grid(ad, (8, 4, 2))
     with pytest.raises(ValueError, match=r"\(8, 4, 2\), expected \(4, 4, 4\)"):
-        grid.restore(other.values(), grid.mask())
+        grid.restore({**grid.state(), "values": other.values()})
     with pytest.raises(ValueError, match=r"\(8, 4, 2\), expected \(4, 4, 4\)"):
-        grid.restore(grid.values(), other.mask())
+        grid.restore({**grid.state(), "mask": other.mask()})
+    with pytest.raises(ValueError, match=r"\(8, 4, 2\), expected \(4, 4, 4\)"):
+        grid.restore({**grid.state(), "floor": other.floor()})
 
 
 @pytest.mark.parametrize(

@@ -249,7 +249,7 @@ def test_empty_cells_are_not_evaluated(ad: Any) -> None:
     edges = np.abs(np.linspace(-1, 1, 17))
     near = np.minimum(edges[:-1], edges[1:]) ** 2
     touched = np.add.outer(np.add.outer(near, near), near) < 0.4**2
-    grid.restore(grid.values(), touched)
+    grid.restore({**grid.state(), "mask": touched})
 
     o, d = (vectors(ad, v) for v in make_rays(100))
     full = render_rays(field, o, d, MarchSettings())
@@ -315,3 +315,80 @@ def test_one_ray_and_one_sample(ad: Any) -> None:
 def test_settings_are_validated(change: dict[str, Any], named: str) -> None:
     with pytest.raises(ValueError, match=named):
         MarchSettings(**change)
+
+
+# ---- Early termination ------------------------------------------------------
+
+
+@pytest.mark.parametrize("stop", [1e-1, 1e-2, 1e-4])
+def test_early_termination_keeps_its_bound(ad: Any, stop: float) -> None:
+    """Opacity loses less than ``stop``, colours less than that times the largest emission."""
+    field = AnalyticField(gaussian((0, 0, 0), 0.3, 40.0), lambda p, d: [1.0, 3.0, 0.5 + 0 * p.x])
+    rays = make_rays(150, seed=4)
+    o, d = (vectors(ad, v) for v in rays)
+    dense = render_rays(field, o, d, MarchSettings())
+    short = render_rays(field, o, d, MarchSettings(stop=stop))
+    lost = image(dense) - image(short)
+    limit = np.array([1, 3, 0.5, 1])[:, None] * stop + 2e-6
+    assert (np.abs(lost[:4]) <= limit).all()
+    assert (lost[3] >= -2e-6).all()
+    assert short.queries < dense.queries
+
+
+def test_a_ray_ends_where_nothing_shows_any_more(ad: Any) -> None:
+    """Opaque at once: the first round of samples is all that is asked for."""
+    rays = make_rays(40)
+    field = AnalyticField(uniform(1e4), None, *BOX)
+    hits = int((np.diff(slow_interval(*rays, *BOX))[:, 0] > 0).sum())
+    o, d = (vectors(ad, v) for v in rays)
+    assert render_rays(field, o, d, MarchSettings(stop=1e-4)).queries == 4 * hits
+    assert render_rays(field, o, d, MarchSettings()).queries == 128 * hits
+
+
+def test_rounds_change_nothing_of_what_is_seen(ad: Any) -> None:
+    """With the least possible limit, every sample is asked for, in whatever order."""
+    field, rays = NeuralField.create(SMALL, 0, ad.TensorXf), make_rays(60)
+    dense = render(ad, field, rays)
+    rounds = render(ad, field, rays, stop=1e-35)
+    assert dense[3].any()
+    np.testing.assert_allclose(rounds, dense, atol=1e-6)
+
+
+# ---- Hidden samples ---------------------------------------------------------
+
+
+def test_hidden_samples_are_left_out(ad: Any) -> None:
+    """Behind an optical depth that the grid has seen everywhere, nothing is asked."""
+    field = AnalyticField(ball(0.8, 60.0))
+    grid = OccupancyGrid(field.lower, field.upper, np.ones((16, 16, 16), bool), ad.Float)
+    rays = make_rays(200, seed=7)
+    o, d = (vectors(ad, v) for v in rays)
+
+    def look(hidden: float) -> RayImage:
+        settings = MarchSettings(samples=64, hidden=hidden)
+        return render_rays(field, o, d, settings, occupancy=grid)
+
+    assert look(5.0).queries == look(0.0).queries  # nothing was seen yet
+    for turn in range(60):
+        grid.refresh(field, dr.rng(seed=turn), turn, queries=8192, threshold=0.01, decay=0.9)
+    assert (grid.floor() <= 60 * 1.00001).all() and grid.floor().max() > 50
+    whole, some = look(0.0), look(9.0)
+    assert some.queries < 0.8 * whole.queries
+    # Their weight would have been exp(−9), but for rays through corners of cells that the
+    # ball does not fill and in which no look fell beside it.
+    lost = image(whole)[3] - image(some)[3]
+    assert np.abs(lost).max() < 0.01 and np.mean(np.abs(lost)) < math.exp(-9)
+
+
+def test_the_floor_is_no_more_than_was_seen(ad: Any) -> None:
+    """One empty look is believed at once, dense ones only by and by."""
+    grid = OccupancyGrid(*BOX, np.ones((2, 2, 2), bool), ad.Float)
+    refresh = {"queries": 16, "threshold": 0.0, "decay": 0.9}
+    dense, empty = (AnalyticField(uniform(v), None, *BOX) for v in (10.0, 0.0))
+    floors = []
+    for turn, field in enumerate([dense, dense, empty, dense]):
+        grid.refresh(field, dr.rng(seed=turn), turn, **refresh)
+        floors.append(grid.floor())
+    assert (0 < floors[0]).all() and (floors[0] < floors[1]).all() and (floors[1] < 5).all()
+    assert (floors[2] == 0).all()
+    assert (0 < floors[3]).all() and (floors[3] <= floors[0]).all()

@@ -36,7 +36,7 @@ class Train:
     out: Path
     """Folder of the run; created."""
     preset: str = "nerf"
-    """Starting point of all settings: nerf or paper."""
+    """Starting point of all settings: nerf, fast or paper."""
     max_seconds: float | None = None
     """Stop after so many seconds of wall-clock time (default 600 if --steps is not given)."""
     steps: int | None = None

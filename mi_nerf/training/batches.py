@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from ..arrays import gather_vector3
 from ..cameras import pack_poses, pixel_rays
 from ..data import Dataset
 
@@ -21,6 +22,27 @@ class RayBatch:
     color: list[Any]  # three arrays of R values, premultiplied
     alpha: Any
     background: list[Any]  # what to place behind both, one value or R values a channel
+
+    def part(self, start: int, rays: int) -> RayBatch:
+        """``rays`` of the rays, from number ``start`` on."""
+        if rays == len(self.alpha):
+            return self
+        index = dr.arange(dr.uint32_array_t(type(self.alpha)), rays)
+        index += dr.opaque(type(index), start)
+
+        def take(values: Any) -> Any:
+            one = len(values) == 1
+            return values if one else dr.gather(type(values), values, index)
+
+        part = RayBatch(
+            gather_vector3(self.o, index),
+            gather_vector3(self.d, index),
+            [take(c) for c in self.color],
+            take(self.alpha),
+            [take(c) for c in self.background],
+        )
+        dr.eval(part.o, part.d, part.color, part.alpha, part.background)
+        return part
 
 
 class RaySource:

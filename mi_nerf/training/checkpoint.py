@@ -9,10 +9,10 @@ import numpy as np
 
 from ..arrays import upload
 from ..errors import InputError
-from ..tensor_file import read_tensors, write_tensors
+from ..tensor_file import prefixed, read_tensors, write_tensors
 from .trainer import Trainer
 
-VERSION = 1
+VERSION = 2  # 2: the occupancy grid's floor
 
 
 def save_checkpoint(path: str | Path, trainer: Trainer, progress: dict[str, Any]) -> None:
@@ -27,8 +27,7 @@ def save_checkpoint(path: str | Path, trainer: Trainer, progress: dict[str, Any]
     arrays = {f"weights.{n}": np.array(t) for n, t in trainer.parameters.items()}
     arrays |= {f"adam.{n}": a for n, a in trainer.optimizer.state().items()}
     if trainer.occupancy is not None:
-        arrays["occupancy.values"] = trainer.occupancy.values()
-        arrays["occupancy.mask"] = trainer.occupancy.mask()
+        arrays |= {f"occupancy.{n}": a for n, a in trainer.occupancy.state().items()}
     description = {
         "step": trainer.step_count,
         "attempt": trainer.attempt,
@@ -57,12 +56,9 @@ def load_checkpoint(path: str | Path, trainer: Trainer) -> dict[str, Any]:
             if saved.shape != tensor.shape:
                 raise ValueError(f"tensor '{name}' is {saved.shape}, expected {tensor.shape}")
             trainer.optimizer.assign(name, upload(type(tensor), saved))
-        prefix = "adam."
-        trainer.optimizer.restore(
-            {n.removeprefix(prefix): a for n, a in arrays.items() if n.startswith(prefix)}
-        )
+        trainer.optimizer.restore(prefixed(arrays, "adam."))
         if trainer.occupancy is not None:
-            trainer.occupancy.restore(arrays["occupancy.values"], arrays["occupancy.mask"])
+            trainer.occupancy.restore(prefixed(arrays, "occupancy."))
         trainer.step_count = description["step"]
         trainer.rays_per_step = description["rays_per_step"]
         progress: dict[str, Any] = description["progress"]

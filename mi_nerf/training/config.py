@@ -11,6 +11,7 @@ from typing import Any, Literal
 from ..activations import ColorActivation, DensityActivation
 from ..encoding import FourierEncoding
 from ..errors import InputError
+from ..hash_grid import HashGridConfig
 from ..network import NetworkConfig
 from .plain import assign, build, leaf_names, require
 
@@ -58,15 +59,18 @@ class SamplingConfig:
     render_fine: int | None = None  # samples more in evaluation; none: as in training
     batch: int = 32768  # field queries a step, at most
     max_rays: int = 16384  # rays a step, at most
+    render_stop: float = 1e-4  # transmittance at which a ray ends in evaluation; 0: never
     rays: int | None = None  # rays a step; none: as many as fill the batch
     near: float | None = None  # fixed bounds instead of the box alone, scene units
     far: float | None = None
     block: int = 16384  # queries the network evaluates at a time
+    hidden: float = 0.0  # training leaves out samples behind this optical depth; 0: none
 
     def __post_init__(self) -> None:
         require(self, "samples render_samples batch max_rays rays block", at_least=1)
-        require(self, "near fine render_fine", at_least=0)
+        require(self, "near fine render_fine hidden", at_least=0)
         require(self, "far", above=0)
+        require(self, "render_stop", at_least=0, below=1)
         if self.batch < self.samples:
             raise ValueError(
                 f"batch={self.batch}, expected at least the samples={self.samples} of one ray"
@@ -112,6 +116,7 @@ class TrainConfig:
     color_activation: Literal["auto"] | ColorActivation = "auto"
     network: NetworkConfig = field(default_factory=NetworkConfig)
     position: FourierEncoding | None = None  # none: as many octaves as the images resolve
+    grid: HashGridConfig | None = None  # features of a hash grid, besides those of position
     direction: FourierEncoding = field(default_factory=lambda: FourierEncoding(frequencies=4))
     density: DensityConfig = field(default_factory=DensityConfig)
     occupancy: OccupancyConfig = field(default_factory=OccupancyConfig)
@@ -124,7 +129,7 @@ class TrainConfig:
     crop_steps: int = 0  # so many first steps see only the middle of the images,
     crop: float = 0.5  # this share of their width and height
     max_skipped: int = 20  # non-finite steps in a row that end the run
-    store_activations: float = 6.0  # GiB of activations kept for the backward pass
+    store_activations: float = 3.0  # GiB of activations; larger steps are taken in parts
 
     def __post_init__(self) -> None:
         require(self, "seed", at_least=0, below=1 << 31)
@@ -132,7 +137,8 @@ class TrainConfig:
         require(self, "max_seconds", above=0)
         require(self, "report_every checkpoint_every crop_steps", at_least=0)
         require(self, "crop", above=0, at_most=1)
-        require(self, "collapse_check max_restarts store_activations", at_least=0)
+        require(self, "collapse_check max_restarts", at_least=0)
+        require(self, "store_activations", above=0)
         box = self.box or (0, 0, 0, 1, 1, 1)
         if not all(box[i] < box[i + 3] for i in range(3)):
             raise ValueError(f"box={self.box}, expected three minima below three maxima")

@@ -14,6 +14,12 @@ import drjit as dr
 import numpy as np
 
 from ..arrays import upload
+from ..network import GRID
+
+
+def _choose(mask: Any, a: Any, b: Any) -> Any:
+    """A tensor of the entries of ``a`` where the flat ``mask`` holds, else of ``b``."""
+    return type(a)(dr.select(mask, a.array, b.array), shape=b.shape)
 
 
 class JointParameters(MutableMapping[str, Any]):
@@ -41,7 +47,11 @@ class JointParameters(MutableMapping[str, Any]):
 
 
 class Adam:
-    """Updates a dictionary of tensors in place from their gradients."""
+    """Updates a dictionary of tensors in place from their gradients.
+
+    Entries of hash grids whose gradient is 0 were not looked at by any sample: they and
+    their moments stay as they are (Müller et al. 2022).
+    """
 
     def __init__(
         self,
@@ -83,9 +93,10 @@ class Adam:
             m_new = dr.fma(m - g, self._beta1, g)
             v_new = dr.fma(v - dr.square(g), self._beta2, dr.square(g))
             new = dr.detach(old) - rate * m_new / (dr.sqrt(v_new) + self._epsilon)
-            self._first[name] = dr.select(accept, m_new, m)
-            self._second[name] = dr.select(accept, v_new, v)
-            self._renew(name, dr.select(accept, new, dr.detach(old)))
+            taken = accept & (g.array != 0) if name.endswith(GRID) else accept
+            self._first[name] = _choose(taken, m_new, m)
+            self._second[name] = _choose(taken, v_new, v)
+            self._renew(name, _choose(taken, new, dr.detach(old)))
         dr.schedule(list(self._parameters.values()), self._first, self._second)
         dr.eval()
         return accept

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from ..encoding import FourierEncoding
 from ..errors import InputError
+from ..hash_grid import HashGridConfig
 from ..network import NetworkConfig
 from .config import (
     DensityConfig,
@@ -26,6 +27,20 @@ def nerf() -> TrainConfig:
     )
 
 
+def fast() -> TrainConfig:
+    """Features of a hash grid into a small network (Müller et al. 2022)."""
+    return TrainConfig(
+        preset="fast",
+        network=NetworkConfig(depth=1, width=64, skip=-1, feature_layer=False, view_width=64),
+        position=FourierEncoding(frequencies=0),
+        grid=HashGridConfig(),
+        direction=FourierEncoding(frequencies=2),
+        density=DensityConfig(gain=10.0),
+        sampling=SamplingConfig(batch=16384, hidden=10.0),
+        optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, epsilon=1e-15),
+    )
+
+
 def paper() -> TrainConfig:
     """The published model and schedule: coarse and fine network (NeRF Sec. 5.2 and 5.3)."""
     return TrainConfig(
@@ -34,12 +49,14 @@ def paper() -> TrainConfig:
         position=FourierEncoding(frequencies=10),
         density=DensityConfig(activation="relu", shift=0.0, noise=1.0),
         occupancy=OccupancyConfig(enabled=False, hull=False),
-        sampling=SamplingConfig(samples=64, fine=128, render_samples=64, rays=4096, batch=1 << 21),
+        sampling=SamplingConfig(
+            samples=64, fine=128, render_samples=64, render_stop=0.0, rays=4096, batch=1 << 21
+        ),
         optimizer=OptimizerConfig(warmup=0, beta2=0.999, epsilon=1e-7),
     )
 
 
-PRESETS = {"nerf": nerf, "paper": paper}
+PRESETS = {"nerf": nerf, "fast": fast, "paper": paper}
 
 
 def preset(name: str) -> TrainConfig:

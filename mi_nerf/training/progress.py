@@ -26,7 +26,7 @@ class Meter:
     def add(self, loss: float, mse: float, result: StepResult) -> None:
         self._losses.append(loss)
         self._errors.append(mse)
-        self._rays += result.rays
+        self._rays += int(result.rays[0])
         self._queries += result.queries
 
     def summary(self) -> dict[str, Any]:

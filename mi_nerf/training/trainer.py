@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -37,7 +37,7 @@ class StepResult:
     loss: Any
     mse: Any
     accepted: Any
-    rays: int
+    rays: Any  # that counted
     queries: int
 
 
@@ -52,10 +52,15 @@ def field_config(config: TrainConfig, dataset: Dataset) -> NeuralFieldConfig:
     color = config.color_activation
     if color == "auto":
         color = "sigmoid" if dataset.color_space == "srgb" else "exp"
+    grid = config.grid
+    if grid is not None and grid.finest is None:
+        finest = 2 ** (resolved_octaves(dataset, lower, upper) + 1)
+        grid = replace(grid, finest=max(grid.coarsest, finest))
     model = NeuralFieldConfig(
         color_space=dataset.color_space,
         position=config.position
         or FourierEncoding(frequencies=resolved_octaves(dataset, lower, upper)),
+        grid=grid,
         direction=config.direction,
         network=config.network,
         density_activation=config.density.activation,
@@ -94,6 +99,14 @@ def _require_memory(config: TrainConfig) -> None:
             f"sampling.samples={sampling.samples}, fine={sampling.fine}: one step would need "
             f"{needed / 2**30:.0f} GiB for its samples, expected less than {there / 2**30:.0f} GiB"
         )
+
+
+def _rows(values: Any, part: tuple[int, int], count: int) -> Any:
+    """The ``count`` values of each ray of a part."""
+    if len(values) == part[1] * count:
+        return values
+    index = dr.arange(dr.uint32_array_t(type(values)), part[1] * count)
+    return dr.gather(type(values), values, index + dr.opaque(type(index), part[0] * count))
 
 
 class Trainer:
@@ -152,31 +165,46 @@ class Trainer:
     def march_settings(self) -> MarchSettings:
         """How rays are sampled in training."""
         s = self.config.sampling
-        return MarchSettings(samples=s.samples, near=s.near, far=s.far, block=min(s.block, s.batch))
+        return MarchSettings(
+            samples=s.samples, near=s.near, far=s.far, hidden=s.hidden, block=min(s.block, s.batch)
+        )
 
     def step(self, learning_rate: float) -> StepResult:
         """One optimisation step. Launches work; reads nothing back but sample counts."""
-        config = self.config
-        rng = step_rng(self._backend.Float, config.seed, self.step_count)
+        config, float_type = self.config, self._backend.Float
+        rng = step_rng(float_type, config.seed, self.step_count)
         rays = self._ray_count()
         crop = config.crop if self.step_count < config.crop_steps else 1.0
         batch = self._source.draw(rays, rng, crop)
-        jitter = rng.random(self._backend.Float, rays * config.sampling.samples)
-        samples = place_samples(
-            self.field,
-            batch.o,
-            batch.d,
-            self.march_settings(),
-            occupancy=self.occupancy,
-            jitter=jitter,
-        )
+        jitter = rng.random(float_type, rays * config.sampling.samples)
+        fine = config.sampling.fine
+        fine_jitter = rng.random(float_type, rays * fine) if fine else float_type()
+        dr.eval(jitter, fine_jitter)
         self.optimizer.zero_grad()
         with self._noise():
-            loss, mse, complete, queries = self._differentiate(batch, samples, rng)
+            parts = [
+                self._differentiate(batch.part(*part), part, rays, jitter, fine_jitter)
+                for part in self._parts(rays)
+            ]
+        loss, mse, counted = (sum(v[1:], v[0]) for v in list(zip(*parts, strict=True))[:3])
         accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
         self.step_count += 1
+        self._adapt_rays(rays, sum(part[4] for part in parts))
         self._refresh_occupancy()
-        return StepResult(loss, mse, accepted, complete, queries)
+        return StepResult(loss, mse, accepted, counted, sum(part[3] for part in parts))
+
+    def _parts(self, rays: int) -> Iterator[tuple[int, int]]:
+        """Ranges of rays whose activations fit together in the memory set aside for them."""
+        sampling, network = self.config.sampling, self.config.network
+        units = self.field_config.position_size + self.config.direction.size
+        units += network.depth * network.width + int(network.feature_layer) * network.width
+        units += network.view_depth * network.view_width
+        most = sampling.samples + bool(sampling.fine) * (sampling.samples + sampling.fine)
+        needed = 4 * units * min(sampling.batch, rays * most)
+        count = math.ceil(needed / (self.config.store_activations * 2**30))
+        size = math.ceil(rays / min(count, rays))
+        for start in range(0, rays, size):
+            yield start, min(size, rays - start)
 
     @contextmanager
     def _noise(self) -> Iterator[None]:
@@ -192,57 +220,70 @@ class Trainer:
                 network.noise = None
 
     def _differentiate(
-        self, batch: RayBatch, samples: Samples, rng: Any
-    ) -> tuple[Any, Any, int, int]:
-        """Gradients of the loss over the rays that fit in the batch end in the parameters.
+        self, batch: RayBatch, part: tuple[int, int], rays: int, jitter: Any, fine_jitter: Any
+    ) -> tuple[Any, Any, Any, int, int]:
+        """Gradients of the loss over some of the step's rays are added to the parameters'.
+
+        Args:
+            batch: the rays of this part.
+            part: number of the first one, and how many.
+            rays: those of the whole step.
+            jitter, fine_jitter: for all samples of the step.
 
         Returns:
-            Loss, squared error of the fine network, rays that counted, and queries made.
+            This part of the loss and of the squared error of the fine network, rays that
+            counted, queries made, and queries that all of its rays would need.
         """
-        budget, fine = self.config.sampling.batch, self.config.sampling.fine
-        rays, wanted = samples.rays, samples.queries
+        sampling, share = self.config.sampling, part[1] / rays
+        budget = math.ceil(sampling.batch * share)
+        march = self.march_settings()
+        samples = place_samples(
+            self.field,
+            batch.o,
+            batch.d,
+            march,
+            occupancy=self.occupancy,
+            jitter=_rows(jitter, part, sampling.samples),
+        )
+        wanted = samples.queries
         complete = samples.truncate(budget)
         queries, passes = samples.queries, []
         if self.field.coarse is not None:
             coarse = self._evaluate(self.field.coarse, samples)
             passes.append((coarse, integrate(coarse, samples)))
-            jitter = rng.random(self._backend.Float, samples.rays * fine)
+            offsets = _rows(fine_jitter, part, sampling.fine)
             weights = passes[0][1].weights
-            refined = refine(samples, weights, fine, self.occupancy, jitter)
-            wanted += refined.queries
-            complete = min(complete, refined.truncate(max(1, budget - queries)))
-            queries += refined.queries
-            samples = refined
-        self._adapt_rays(rays, wanted)
+            samples = refine(samples, weights, sampling.fine, self.occupancy, offsets, march.hidden)
+            wanted += samples.queries
+            complete = dr.minimum(complete, samples.truncate(max(1, budget - queries)))
+            queries += samples.queries
         evaluation = self._evaluate(self.field, samples)
         passes.append((evaluation, integrate(evaluation, samples)))
-        errors = [self._errors(batch, seen, complete) for _, seen in passes]
+        errors = [self._errors(batch, seen, complete, share) for _, seen in passes]
         loss = sum((e for e, _ in errors), self._backend.Float(0))  # NeRF Eq. 6: of both
         dr.backward(loss)
         loss, mse = dr.detach(loss), errors[-1][1]
-        dr.eval(loss, mse)
+        dr.eval(loss, mse, complete)
         for evaluation, _ in passes:
             evaluation.backward()
-        return loss, mse, complete, queries
+        return loss, mse, complete, queries, wanted
 
     def _evaluate(self, field: NeuralField, samples: Samples) -> Evaluation:
-        evaluation = Evaluation(
-            field, samples, self.march_settings().block, keep=self._keep(samples)
-        )
+        evaluation = Evaluation(field, samples, self.march_settings().block, keep=True)
         evaluation.enable_grad()
         return evaluation
 
-    def _errors(self, batch: RayBatch, seen: Composite, complete: int) -> tuple[Any, Any]:
-        """Loss and squared error of one network's image, means over the first rays."""
+    def _errors(
+        self, batch: RayBatch, seen: Composite, complete: Any, share: float
+    ) -> tuple[Any, Any]:
+        """Loss and squared error of one network's image: ``share`` of the first rays' means."""
         predicted = over_background(seen.color, seen.opacity, batch.background)
         target = over_background(batch.color, batch.alpha, batch.background)
         float_type = self._backend.Float
-        used = dr.arange(self._backend.UInt32, len(seen.opacity)) < dr.opaque(
-            self._backend.UInt32, complete
-        )
-        share = dr.opaque(float_type, 1 / max(complete, 1))
-        loss = dr.sum(dr.select(used, self._loss(predicted, target), 0)) * share
-        mse = dr.sum(dr.select(used, dr.detach(squared_error(predicted, target)), 0)) * share
+        used = dr.arange(self._backend.UInt32, len(seen.opacity)) < complete
+        weight = dr.opaque(float_type, share) / float_type(dr.maximum(complete, 1))
+        loss = dr.sum(dr.select(used, self._loss(predicted, target), 0)) * weight
+        mse = dr.sum(dr.select(used, dr.detach(squared_error(predicted, target)), 0)) * weight
         return loss, mse
 
     def _carve(self, dataset: Dataset) -> np.ndarray[Any, Any]:
@@ -264,15 +305,6 @@ class Trainer:
         wanted = 0.95 * sampling.batch * rays / max(queries, 1)
         wanted = min(max(wanted, 64.0), float(sampling.max_rays))
         self.rays_per_step += 0.1 * (wanted - self.rays_per_step)
-
-    def _keep(self, samples: Samples) -> bool:
-        """Whether the activations of this batch fit in the memory set aside for them."""
-        config, network = self.field_config, self.config.network
-        units = config.position.size + config.direction.size + network.depth * network.width
-        units += int(network.feature_layer) * network.width
-        units += network.view_depth * network.view_width
-        units *= 2 if self.config.sampling.fine else 1  # both networks keep theirs
-        return samples.queries * units * 4 < self.config.store_activations * 2**30
 
     def _refresh_occupancy(self) -> None:
         options = self.config.occupancy
