@@ -220,6 +220,7 @@ class Evaluation:
         """Evaluates the field; with ``keep``, activations stay for :meth:`backward`."""
         self._field, self._samples, self._block = field, samples, block
         self._graph: list[tuple[Any, Any, list[Any]]] = []
+        self._in_rounds = stop > 0
         float_type = type(samples.t)
         self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4)]
         dr.make_opaque(self._channels)  # without queries they would stay constants
@@ -253,6 +254,8 @@ class Evaluation:
         samples, float_type = self._samples, type(self._samples.t)
         uint = type(samples.index)
         pending = samples.index
+        if not len(pending):
+            return
         limit = dr.opaque(float_type, -math.log(stop))
         rank = _rank_in_ray(pending // samples.count, samples.rays)
         size, start = _FIRST_ROUND, 0
@@ -317,12 +320,21 @@ class Evaluation:
     def _blocks(self, index: Any) -> Iterator[tuple[Any, Any]]:
         """Sample numbers and validity of each block; the last one is padded."""
         uint = type(index)
-        for start in range(0, len(index), self._block):
-            slot = dr.arange(uint, self._block) + dr.opaque(uint, start)
+        for start, size in self._ranges(len(index)):
+            slot = dr.arange(uint, size) + dr.opaque(uint, start)
             valid = slot < dr.opaque(uint, len(index))
             where = dr.gather(uint, index, slot, valid)
             dr.eval(where, valid)
             yield where, valid
+
+    def _ranges(self, queries: int) -> Iterator[tuple[int, int]]:
+        """Starts and sizes of blocks; rounds end in smaller ones, to waste less on padding."""
+        small = self._block // 4 if self._in_rounds and self._block >= 4096 else self._block
+        start = 0
+        while start < queries:
+            size = self._block if queries - start > self._block - small else small
+            yield start, size
+            start += size
 
     def _query(self, where: Any) -> list[Any]:
         samples = self._samples
