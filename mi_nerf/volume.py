@@ -100,12 +100,13 @@ class Samples:
         Rays from that number on are incomplete and must be left out of a loss. The number
         is an array of one element, which the host need not wait for.
         """
-        uint = type(self.index)
-        if self.queries <= budget:
-            return dr.opaque(uint, self.rays)
-        first_lost = dr.gather(uint, self.index, dr.opaque(uint, budget))
-        self.index = dr.gather(uint, self.index, dr.arange(uint, budget))
-        return first_lost // self.count
+        uint, queries = type(self.index), self.queries
+        after = dr.opaque(uint, budget)
+        lost = after < dr.opaque(uint, queries)  # the same kernels, whether or not there are any
+        first_lost = dr.gather(uint, self.index, after, lost)
+        kept = dr.arange(uint, min(queries, budget)) + dr.opaque(uint, 0)
+        self.index = dr.gather(uint, self.index, kept)
+        return dr.select(lost, first_lost // self.count, dr.opaque(uint, self.rays))
 
 
 def place_samples(
@@ -216,11 +217,18 @@ class Evaluation:
         *,
         keep: bool = False,
         stop: float = 0.0,
+        tail: int | None = None,
     ) -> None:
-        """Evaluates the field; with ``keep``, activations stay for :meth:`backward`."""
+        """Evaluates the field; with ``keep``, activations stay for :meth:`backward`.
+
+        Args:
+            block: queries the network evaluates at a time.
+            tail: of the last blocks, to waste less on filling them up. Default: a quarter
+                of large blocks in rounds, else the same.
+        """
         self._field, self._samples, self._block = field, samples, block
         self._graph: list[tuple[Any, Any, list[Any]]] = []
-        self._in_rounds = stop > 0
+        self._tail = tail or (block // 4 if stop > 0 and block >= 4096 else block)
         fused = getattr(field, "fused", None)
         self._fused = fused() if fused is not None and not keep else None
         float_type = type(samples.t)
@@ -331,8 +339,8 @@ class Evaluation:
             yield where, valid
 
     def _ranges(self, queries: int, block: int) -> Iterator[tuple[int, int]]:
-        """Starts and sizes of blocks; rounds end in smaller ones, to waste less on padding."""
-        small = block // 4 if self._in_rounds and block == self._block >= 4096 else block
+        """Starts and sizes of blocks."""
+        small = min(self._tail, block) if block == self._block else block
         start = 0
         while start < queries:
             size = block if queries - start > block - small else small

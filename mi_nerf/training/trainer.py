@@ -25,7 +25,7 @@ from .config import TrainConfig
 from .losses import LOSSES, squared_error
 from .optimizer import Adam, JointParameters
 
-_FEWEST_RAYS = 64  # in a step
+_FEWEST_RAYS = 8  # in a step
 _BYTES_PER_SAMPLE = 100  # parameter, width, density, colour, weight, and their adjoints
 _COARSE_SEED = 500  # apart from the seeds of the fine network and of its restarts
 
@@ -269,7 +269,13 @@ class Trainer:
         return loss, mse, complete, queries, wanted
 
     def _evaluate(self, field: NeuralField, samples: Samples) -> Evaluation:
-        evaluation = Evaluation(field, samples, self.march_settings().block, keep=True)
+        """With two networks, each evaluates its share of the batch, filled up but little."""
+        sampling, block = self.config.sampling, self.march_settings().block
+        if sampling.fine:
+            both = 2 * sampling.samples + sampling.fine
+            block = min(block, math.ceil(sampling.batch * samples.count / both))
+        tail = math.ceil(block / 4) if sampling.fine else block
+        evaluation = Evaluation(field, samples, block, keep=True, tail=tail)
         evaluation.enable_grad()
         return evaluation
 
@@ -294,16 +300,17 @@ class Trainer:
         return np.ones(grid_shape(lower, upper, options.resolution), bool)
 
     def _ray_count(self) -> int:
-        """Rays of the next step, in steps of 64 so that arrays are seldom resized."""
+        """Rays of the next step, in coarse steps so that arrays are seldom resized."""
         if self.config.sampling.rays is not None:
             return self.config.sampling.rays
-        return max(_FEWEST_RAYS, int(self.rays_per_step) // 64 * 64)
+        step = 64 if self.rays_per_step >= 512 else _FEWEST_RAYS
+        return max(_FEWEST_RAYS, int(self.rays_per_step) // step * step)
 
     def _adapt_rays(self, rays: int, queries: int) -> None:
         """Aims at a full batch: more rays as space turns out to be empty."""
         sampling = self.config.sampling
         wanted = 0.95 * sampling.batch * rays / max(queries, 1)
-        wanted = min(max(wanted, 64.0), float(sampling.max_rays))
+        wanted = min(max(wanted, float(_FEWEST_RAYS)), float(sampling.max_rays))
         self.rays_per_step += 0.1 * (wanted - self.rays_per_step)
 
     def _refresh_occupancy(self) -> None:
