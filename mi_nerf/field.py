@@ -17,6 +17,7 @@ from .encoding import FourierEncoding, stack_rows
 from .hash_grid import HashGrid, HashGridConfig
 from .ndc import Ndc
 from .network import NetworkConfig
+from .stages import settled, stage
 
 Corner = tuple[float, float, float]
 ColorSpace = Literal["srgb", "linear"]
@@ -199,7 +200,8 @@ class NeuralField:
         """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
         config = self.config
         h = self._trunk(p)
-        direction = config.direction(d) if config.network.view_dependent else None
+        with stage("encoding"):
+            direction = settled(config.direction(d)) if config.network.view_dependent else None
         raw = network.color_head(config.network, self._weights, h, direction)
         return self._density(h, p), [apply_activation(config.color_activation, c) for c in raw]
 
@@ -208,10 +210,12 @@ class NeuralField:
         unit = vector3_type(type(p[0]))(
             *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
         )
-        features = config.position.features(unit)
-        if self._grid is not None:
-            features += self._grid.features(unit, self._weights[network.GRID])
-        return network.trunk(config.network, self._weights, stack_rows(features))
+        with stage("encoding"):
+            features = config.position.features(unit)
+            if self._grid is not None:
+                features += self._grid.features(unit, self._weights[network.GRID])
+            stacked = settled(stack_rows(features))
+        return network.trunk(config.network, self._weights, stacked)
 
     def _density(self, h: Any, p: Any) -> Any:
         config = self.config
