@@ -130,7 +130,28 @@ def _held_out(
         raise InputError(f"{target.path}: a field file knows no dataset, expected --data too")
     if data is None and not path.exists():
         raise InputError(f"{path}: the dataset of {target.path} is gone, expected --data")
-    return load_dataset(path, split, downscale=scale, limit=views)
+    dataset = load_dataset(path, split, downscale=scale, limit=views)
+    _require_same_projection(target, dataset)
+    return dataset
+
+
+def _require_same_projection(target: Target, dataset: Dataset) -> None:
+    """Refuses to look at a field of one capture with the cameras of another kind."""
+    ours, theirs = target.contents.config.ndc, dataset.ndc
+    if ours is None and theirs is None:
+        return
+    if ours is None or theirs is None:
+        has, wants = ("a forward-facing capture", "posed images all around")
+        raise InputError(
+            f"{dataset.path}: {has if ours is None else wants}, expected "
+            f"{wants if ours is None else has} as {target.path} was trained on"
+        )
+    # Cropping the remainder of a downscaled image changes the angle a little.
+    scales = [(ours.scale_x, theirs.scale_x), (ours.scale_y, theirs.scale_y)]
+    if any(abs(a / b - 1) > 0.05 for a, b in scales) or ours.near != theirs.near:
+        raise InputError(
+            f"{dataset.path}: {theirs}, expected about {ours} as {target.path} was trained with"
+        )
 
 
 def _compare(predicted: Image, truth: Image) -> dict[str, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
@@ -14,6 +14,7 @@ from . import network
 from .activations import ColorActivation, DensityActivation, apply_activation
 from .arrays import upload, vector3_type
 from .encoding import FourierEncoding, stack_rows
+from .fused_network import FusedNetwork, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
 from .ndc import Ndc
 from .network import NetworkConfig
@@ -194,7 +195,7 @@ class NeuralField:
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
-        return self._density(self._trunk(p), p)
+        return self._density(network.density_head(self._weights, self._trunk(p)), p)
 
     def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
         """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
@@ -203,23 +204,46 @@ class NeuralField:
         with stage("encoding"):
             direction = settled(config.direction(d)) if config.network.view_dependent else None
         raw = network.color_head(config.network, self._weights, h, direction)
-        return self._density(h, p), [apply_activation(config.color_activation, c) for c in raw]
+        return self._density(network.density_head(self._weights, h), p), self._color(raw)
+
+    def fused(self) -> Callable[[Any, Any], tuple[Any, list[Any]]] | None:
+        """:meth:`density_emission` of the weights as they are, as one kernel without gradients.
+
+        ``None`` where that would be slower.
+        """
+        config = self.config
+        if not worth_fusing(config.network, type(next(iter(self._weights.values())).array)):
+            return None
+        fused = FusedNetwork(config.network, self._weights)
+
+        def density_emission(p: Any, d: Any) -> tuple[Any, list[Any]]:
+            direction = config.direction.features(d) if config.network.view_dependent else None
+            density, color = fused(self._features(p), direction)
+            return self._density(density, p), self._color(color)
+
+        return density_emission
 
     def _trunk(self, p: Any) -> Any:
+        with stage("encoding"):
+            position = settled(stack_rows(self._features(p)))
+        return network.trunk(self.config.network, self._weights, position)
+
+    def _features(self, p: Any) -> list[Any]:
         config = self.config
         unit = vector3_type(type(p[0]))(
             *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
         )
-        with stage("encoding"):
-            features = config.position.features(unit)
-            if self._grid is not None:
-                features += self._grid.features(unit, self._weights[network.GRID])
-            stacked = settled(stack_rows(features))
-        return network.trunk(config.network, self._weights, stacked)
+        features = config.position.features(unit)
+        if self._grid is not None:
+            features += self._grid.features(unit, self._weights[network.GRID])
+        return features
 
-    def _density(self, h: Any, p: Any) -> Any:
+    def _color(self, raw: list[Any]) -> list[Any]:
+        return [apply_activation(self.config.color_activation, c) for c in raw]
+
+    def _density(self, raw: Any, p: Any) -> Any:
         config = self.config
-        raw = network.density_head(self._weights, h) + config.density_shift
+        raw = raw + config.density_shift
         if self.noise is not None:
             raw = raw + self.noise.at(p)
         return apply_activation(config.density_activation, raw) * config.density_scale

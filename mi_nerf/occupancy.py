@@ -22,6 +22,9 @@ from .field import Corner, Field
 # Value of a cell that was never looked at: occupied whatever the threshold.
 _UNSEEN = np.float32(np.finfo(np.float32).max)
 
+# Share of the threshold below which a cell is empty even if the whole scene is that thin.
+FAINTEST = 1e-4
+
 # The least density of a cell follows a smaller one at once, a larger one by this share a look.
 _FLOOR_RISE = 0.1
 
@@ -93,7 +96,9 @@ class OccupancyGrid:
         Half of them take their turn among all cells that are not known to be empty for
         good, half among those sampled now. A value decays by ``decay`` at every look and
         never stays below the density just seen; a cell counts as empty once its value
-        times the mean edge length is below ``threshold``.
+        times the mean edge length is below ``threshold``, or below half the mean over all
+        cells where that is less, as in a scene that is nothing but thin fog. Below
+        :data:`FAINTEST` of the threshold even such fog counts as nothing.
 
         Args:
             rng: a Dr.Jit generator, for the place within each cell.
@@ -104,9 +109,13 @@ class OccupancyGrid:
         for pool in (self._candidates, sampled):
             if len(pool):
                 self._look(field, pool, turn * half, half, rng, decay)
-        thickness = float(np.mean(self.cell_size))
-        dense = self._values >= dr.opaque(self._float, threshold / thickness)
-        self._mask = self._hull & dense
+        limit = dr.opaque(self._float, threshold / float(np.mean(self.cell_size)))
+        seen = self._hull & (self._values < float(_UNSEEN))
+        total = dr.sum(dr.select(seen, self._values, 0))
+        mean = total / dr.fmax(self._float(dr.count(seen)), 1)
+        limit = dr.fmax(dr.fmin(limit, 0.5 * mean), FAINTEST * limit)
+        kept = self._values > limit if threshold > 0 else True
+        self._mask = self._hull & kept
         dr.eval(self._mask, self._values)
 
     def state(self) -> dict[str, np.ndarray[Any, Any]]:

@@ -70,6 +70,7 @@ def composite(density: Any, emission: list[Any], t: Any, delta: Any, samples: in
         samples: S.
     """
     weights, opacity = sample_weights(density, delta, samples)
+    dr.eval(weights, opacity)  # once, not in the kernel of every sum below
     color = [dr.block_sum(weights * channel, samples) for channel in emission]
     visible = opacity > 0
     mean_t = dr.block_sum(weights * t, samples) / dr.select(visible, opacity, 1)

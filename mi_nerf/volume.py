@@ -221,6 +221,9 @@ class Evaluation:
         """Evaluates the field; with ``keep``, activations stay for :meth:`backward`."""
         self._field, self._samples, self._block = field, samples, block
         self._graph: list[tuple[Any, Any, list[Any]]] = []
+        self._in_rounds = stop > 0
+        fused = getattr(field, "fused", None)
+        self._fused = fused() if fused is not None and not keep else None
         float_type = type(samples.t)
         self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4)]
         dr.make_opaque(self._channels)  # without queries they would stay constants
@@ -234,13 +237,14 @@ class Evaluation:
 
     def _evaluate(self, index: Any, keep: bool) -> Any:
         """Fills in the samples ``index``, and returns it."""
-        for where, valid in self._blocks(index):
+        size = max(len(index), 1) if self._fused else self._block  # only tensors have shapes
+        for where, valid in self._blocks(index, size):
             if keep:
                 outputs = self._query(where)
                 self._graph.append((where, valid, outputs))
             else:
                 with dr.suspend_grad():
-                    outputs = self._query(where)
+                    outputs = self._query(where, self._fused)
             for channel, value in zip(self._channels, outputs, strict=True):
                 dr.scatter(channel, dr.detach(value), where, valid)
             with stage("scatter"):
@@ -255,6 +259,8 @@ class Evaluation:
         samples, float_type = self._samples, type(self._samples.t)
         uint = type(samples.index)
         pending = samples.index
+        if not len(pending):
+            return
         limit = dr.opaque(float_type, -math.log(stop))
         rank = _rank_in_ray(pending // samples.count, samples.rays)
         size, start = _FIRST_ROUND, 0
@@ -291,7 +297,7 @@ class Evaluation:
         gradients = [dr.grad(channel) for channel in self._channels]
         with stage("compositing"):  # its adjoint
             dr.eval(gradients)
-        kept = self._graph or ((w, v, None) for w, v in self._blocks(self.asked))
+        kept = self._graph or ((w, v, None) for w, v in self._blocks(self.asked, self._block))
         with _private_sums():
             for where, valid, outputs in kept:
                 outputs = outputs or self._query(where)
@@ -308,7 +314,7 @@ class Evaluation:
     def forward(self) -> None:
         """Fills the gradients of density and emission from those of the parameters."""
         tangents = [dr.zeros(type(c), len(c)) for c in self._channels]
-        for where, valid in self._blocks(self.asked):
+        for where, valid in self._blocks(self.asked, self._block):
             outputs = self._query(where)
             # One output may be computed from another: keep the tangents of all.
             dr.forward_to(outputs, flags=dr.ADFlag.ClearNone)
@@ -318,23 +324,33 @@ class Evaluation:
         for channel, tangent in zip(self._channels, tangents, strict=True):
             dr.set_grad(channel, tangent)
 
-    def _blocks(self, index: Any) -> Iterator[tuple[Any, Any]]:
+    def _blocks(self, index: Any, block: int) -> Iterator[tuple[Any, Any]]:
         """Sample numbers and validity of each block; the last one is padded."""
         uint = type(index)
-        for start in range(0, len(index), self._block):
-            slot = dr.arange(uint, self._block) + dr.opaque(uint, start)
+        for start, size in self._ranges(len(index), block):
+            slot = dr.arange(uint, size) + dr.opaque(uint, start)
             valid = slot < dr.opaque(uint, len(index))
             where = dr.gather(uint, index, slot, valid)
             with stage("samples"):
                 dr.eval(where, valid)
             yield where, valid
 
-    def _query(self, where: Any) -> list[Any]:
+    def _ranges(self, queries: int, block: int) -> Iterator[tuple[int, int]]:
+        """Starts and sizes of blocks; rounds end in smaller ones, to waste less on padding."""
+        small = block // 4 if self._in_rounds and block == self._block >= 4096 else block
+        start = 0
+        while start < queries:
+            size = block if queries - start > block - small else small
+            yield start, size
+            start += size
+
+    def _query(self, where: Any, fused: Any = None) -> list[Any]:
         samples = self._samples
         ray = where // samples.count
         t = dr.gather(type(samples.t), samples.t, where)
         p = points_along(samples.o, samples.d, t, ray)
-        density, emission = self._field.density_emission(p, gather_vector3(samples.view, ray))
+        ask = fused or self._field.density_emission
+        density, emission = ask(p, gather_vector3(samples.view, ray))
         return [density, *emission]
 
 

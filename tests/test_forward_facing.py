@@ -260,6 +260,20 @@ def record_data(run: Path) -> str:
     return json.loads((run / "config.json").read_text())["data"]["path"]
 
 
+def test_evaluation_refuses_cameras_of_another_kind(
+    forward_run: Path, blob_run: Path, capture: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    around = record_data(blob_run)
+    said = refused("eval", forward_run, "--data", around)
+    assert f"{around}: posed images all around, expected a forward-facing capture" in said
+    said = refused("eval", blob_run, "--data", capture)
+    assert f"{capture}: a forward-facing capture, expected posed images all around" in said
+    views = np.zeros((9, 24, 32, 3), np.uint8)
+    zoomed = write_llff_dataset(tmp_path, views, forward_poses(9), 2 * 28.0, bounds=(3.0, 9.0))
+    said = refused("eval", forward_run, "--data", zoomed)
+    assert f"{zoomed}: Ndc(" in said and "expected about Ndc(" in said
+
+
 def test_a_run_goes_on(forward_run: Path, tmp_path: Path) -> None:
 
     run = Path(shutil.copytree(forward_run, tmp_path / "run"))

@@ -124,9 +124,17 @@ def test_threshold_is_the_optical_thickness_of_a_cell(
     ad: Any, density: float, expected: float
 ) -> None:
     grid = full_grid(ad)
-    # Cells are 0.25 wide.
-    refresh(ad, grid, AnalyticField(uniform(density)), threshold=0.25)
-    assert grid.fraction() == expected
+    # Cells are 0.25 wide; half of the box is so dense that the mean is far above.
+    field = AnalyticField(lambda p: dr.select(p.x < 0, 100.0, density))
+    refresh(ad, grid, field, threshold=0.25)
+    assert grid.fraction() == 0.5 + 0.5 * expected
+
+
+def test_thin_fog_everywhere_is_kept(ad: Any) -> None:
+    """2e-4 over the whole box: what is all there is must not be taken for empty."""
+    grid = full_grid(ad)
+    refresh(ad, grid, AnalyticField(uniform(1e-4)), 20)
+    assert grid.fraction() == 1
 
 
 def test_cells_are_kept_until_they_are_looked_at(ad: Any) -> None:

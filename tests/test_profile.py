@@ -36,7 +36,7 @@ SMALL = [
 VARIETIES: dict[str, tuple[str, list[str]]] = {
     "nerf": ("nerf", []),
     "fast": ("fast", ["grid.levels=2", "grid.log2_entries=8"]),
-    "hierarchical": ("nerf", ["sampling.fine=8", "sampling.rays=128"]),
+    "hierarchical": ("nerf", ["sampling.fine=8", "sampling.rays=16"]),
 }
 
 

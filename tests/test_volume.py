@@ -345,6 +345,12 @@ def test_a_ray_ends_where_nothing_shows_any_more(ad: Any) -> None:
     assert render_rays(field, o, d, MarchSettings()).queries == 128 * hits
 
 
+def test_rays_that_see_nothing_have_no_rounds(ad: Any) -> None:
+    o, d = vectors(ad, [(5, 5, 5)] * 3), vectors(ad, [(0, 0, 1)] * 3)
+    seen = render_rays(AnalyticField(uniform(1.0)), o, d, MarchSettings(stop=1e-4))
+    assert seen.queries == 0 and not image(seen).any()
+
+
 def test_rounds_change_nothing_of_what_is_seen(ad: Any) -> None:
     """With the least possible limit, every sample is asked for, in whatever order."""
     field, rays = NeuralField.create(SMALL, 0, ad.TensorXf), make_rays(60)

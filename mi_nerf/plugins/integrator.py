@@ -61,7 +61,7 @@ class NerfIntegrator(ADIntegrator):
        - A ray ends where less than this share of the light behind passes, which changes
          the opacity by less than it, and a colour by less than it times the largest
          radiance. Derivatives always take all samples. 0 switches it off.
-         (Default: what the field file suggests, 1e-4 as trained)
+         (Default: what the field file suggests, 1e-3 as trained)
      * - jitter
        - |bool|
        - Shift the samples of every camera ray at random within their strata. Without

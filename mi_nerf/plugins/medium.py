@@ -27,10 +27,9 @@ class NerfMedium(mi.Medium):
          ``mi-nerf import``; looked up like any file of the scene.
      * - field
        - |string|
-       - Instead of ``filename``: a field given by a formula. :monosp:`gaussian` has
-         ``center``, ``width`` (standard deviation), ``peak`` (density at the centre, in
-         1/scene unit), ``radiance`` (a vector: linear RGB) and ``extent`` (half the side of
-         its box, in widths).
+       - Instead of ``filename``: a field given by a formula, :monosp:`slab`,
+         :monosp:`two_color`, :monosp:`fog`, :monosp:`ramp`, :monosp:`step`, :monosp:`sheet`,
+         :monosp:`gaussian` or :monosp:`shell`, and then its parameters, listed below.
      * - occupancy
        - |bool|
        - Skip the cells that the field file marks as empty. (Default: true)
@@ -38,6 +37,69 @@ class NerfMedium(mi.Medium):
        - |tensor|
        - All tensors of the network, e.g. ``trunk_0_weight``, or the formula's parameters.
        - |exposed|, |differentiable|
+
+    **Formulas** (:py:mod:`mi_nerf.closed_form` has the equations and defaults). Lengths are in
+    scene units, densities in 1/scene unit; points, directions and colours are vectors.
+
+    .. pluginparameters::
+
+     * - radiance
+       - |vector|
+       - All: what is emitted, linear RGB, in :monosp:`two_color` along the axis only.
+         (Default: 1, 1, 1; :monosp:`two_color`: 1, 0.5, 0.1)
+     * - opposite
+       - |vector|
+       - :monosp:`two_color`: what is emitted against the axis; in between, the cosine blends.
+         (Default: 0.1, 0.5, 1)
+     * - lower, upper
+       - |vector|
+       - Corners of the box of all but :monosp:`gaussian` and :monosp:`shell`, which end where
+         their density does. (Default: −1, −1, −1 and 1, 1, 1)
+     * - axis
+       - |vector|
+       - :monosp:`fog`, :monosp:`ramp`, :monosp:`step`, :monosp:`sheet`, :monosp:`two_color`:
+         the direction along which they vary. (Default: 0, 0, 1)
+     * - position
+       - |float|
+       - The first four of these: where along the axis their plane is. (Default: 0)
+     * - density
+       - |float|
+       - :monosp:`slab`, :monosp:`two_color` (default: 2), :monosp:`shell` (10): the density;
+         :monosp:`fog`, :monosp:`ramp` (1): that of the plane.
+     * - height
+       - |float|
+       - :monosp:`fog`: the length over which density falls by a factor of e. (Default: 0.5)
+     * - slope
+       - |float|
+       - :monosp:`ramp`: growth of density along the axis. (Default: 1)
+     * - before, beyond
+       - |float|
+       - :monosp:`step`: densities on both sides of the plane. (Default: 0.5 and 5)
+     * - thickness
+       - |float|
+       - :monosp:`sheet`: optical depth along the axis. (Default: 1)
+     * - width
+       - |float|
+       - :monosp:`sheet`: how thin it is (default: 0.02); :monosp:`gaussian`: the standard
+         deviation (0.2).
+     * - edge
+       - |float|
+       - :monosp:`step` (default: 0.05), :monosp:`shell` (0.05), :monosp:`sheet` (0.01): the
+         length over which density goes up or down. With 0 it jumps, and the gradient with
+         respect to the place of the jump is lost.
+     * - center
+       - |vector|
+       - :monosp:`gaussian`, :monosp:`shell`: their centre. (Default: 0, 0, 0)
+     * - peak, extent
+       - |float|
+       - :monosp:`gaussian`: density at the centre, and half the side of its box in widths.
+         (Default: 10 and 4.5)
+     * - inner, outer
+       - |float|
+       - :monosp:`shell`: its radii. (Default: 0.4 and 0.6)
+
+    All but the box (``lower``, ``upper``, ``extent``) are exposed and differentiable. The box
+    stays as it was when they change.
 
     The medium belongs inside a ``cube``. The cube's ``to_world`` carries the field's own
     coordinate system into the scene: with the identity the field appears where it was
@@ -91,13 +153,10 @@ class NerfMedium(mi.Medium):
         if "filename" in props:
             raise InputError("nerfmedium: both 'filename' and 'field', expected one of them")
         self._source = str(props["field"])
-        values = {}
-        for name in (n for n in props.unqueried() if n != "to_world"):
-            value = props[name]
-            values[name] = value if isinstance(value, float) else tuple(map(float, value))
+        values = {n: _plain(props[n]) for n in props.unqueried() if n != "to_world"}
         try:
             self.field = closed_form(self._source, values, mi.TensorXf)
-        except (TypeError, ValueError) as error:
+        except ValueError as error:
             raise InputError(f"nerfmedium: {error}") from error
         self.march = MarchSettings(samples=128)
 
@@ -128,6 +187,16 @@ class NerfMedium(mi.Medium):
             f"  occupancy = {self.occupancy is not None}\n"
             "]"
         )
+
+
+def _plain(value: Any) -> Any:
+    """Mitsuba's vectors and colours as tuples; anything else as it is."""
+    if isinstance(value, str | int | float):
+        return value
+    try:
+        return tuple(float(entry) for entry in value)
+    except TypeError:
+        return value
 
 
 mi.register_medium("nerfmedium", NerfMedium)

@@ -59,7 +59,7 @@ class SamplingConfig:
     render_fine: int | None = None  # samples more in evaluation; none: as in training
     batch: int = 32768  # field queries a step, at most
     max_rays: int = 16384  # rays a step, at most
-    render_stop: float = 1e-4  # transmittance at which a ray ends in evaluation; 0: never
+    render_stop: float = 1e-3  # transmittance at which a ray ends in evaluation; 0: never
     rays: int | None = None  # rays a step; none: as many as fill the batch
     near: float | None = None  # fixed bounds instead of the box alone, scene units
     far: float | None = None

@@ -27,7 +27,9 @@ def main() -> None:
     parser.add_argument("--split", default="val")
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--seconds", type=float, default=120.0)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=3, help="how many")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--views", type=int, help="evaluate so many views, evenly spread")
     parser.add_argument("--preset", default="nerf")
     parser.add_argument("--set", nargs="*", default=[])
     options = parser.parse_args()
@@ -35,10 +37,11 @@ def main() -> None:
     print(machine())
     print(
         f"{options.data}, downscale {options.downscale}, split {options.split}, "
-        f"preset {options.preset} {' '.join(options.set)}, {options.seconds:g} s of training"
+        f"preset {options.preset} {' '.join(options.set)}, {options.seconds:g} s of training, "
+        f"{options.views or 'all'} views"
     )
     results = []
-    for seed in range(options.seeds):
+    for seed in range(options.first_seed, options.first_seed + options.seeds):
         with tempfile.TemporaryDirectory() as folder:
             results.append(_train_and_evaluate(data, Path(folder), seed, options))
         print(f"seed {seed}: {_line(results[-1])}", flush=True)
@@ -58,6 +61,8 @@ def _train_and_evaluate(
         train += ["--set", *options.set]
     subprocess.run(command + train, check=True, stdout=subprocess.DEVNULL)
     evaluate = ["eval", str(run), "--split", options.split, "--json", str(record)]
+    if options.views:
+        evaluate += ["--views", str(options.views)]
     subprocess.run(command + evaluate, check=True, stdout=subprocess.DEVNULL)
     result = json.loads(record.read_text())
     log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
