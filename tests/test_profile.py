@@ -16,8 +16,8 @@ from mi_nerf.encoding import FourierEncoding
 from mi_nerf.field import NeuralFieldConfig
 from mi_nerf.hash_grid import HashGridConfig
 from mi_nerf.report.arithmetic import multiply_adds, numpy_product_rate, training_flop
-from mi_nerf.report.profile import LABELS, markdown, profile_steps
-from mi_nerf.stages import recording, settled, stage
+from mi_nerf.report.profile import LABELS, markdown, profile_steps, stage_times
+from mi_nerf.stages import Launch, recording, settled, stage
 from mi_nerf.training.config import TrainConfig, with_settings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.trainer import Trainer
@@ -36,7 +36,7 @@ SMALL = [
 VARIETIES: dict[str, tuple[str, list[str]]] = {
     "nerf": ("nerf", []),
     "fast": ("fast", ["grid.levels=2", "grid.log2_entries=8"]),
-    "hierarchical": ("nerf", ["sampling.fine=8", "sampling.rays=16"]),
+    "hierarchical": ("nerf", ["sampling.fine=8", "sampling.rays=32", "sampling.batch=2048"]),
 }
 
 
@@ -163,19 +163,33 @@ def test_stages_and_python_add_up_to_the_step(variety: str, views: Dataset) -> N
     assert set(profile.stages) == set(LABELS)
     assert sum(profile.stages.values()) == pytest.approx(profile.step_ms)
     assert profile.fastest_ms <= profile.step_ms <= profile.slowest_ms
-    # Kernels run one after another: together they take no longer than the same steps do,
-    # nor than steps without boundaries, within their spread.
-    kernels = sum(ms for name, ms in profile.stages.items() if name != "python")
-    assert 0 < kernels < profile.profiled_ms and kernels < profile.slowest_ms
+    assert min(profile.stages.values()) >= 0
     # Nearly all of them are in some stage, and each stage has its share.
     assert profile.launches["other"] < 0.05 * sum(profile.launches.values())
     busy = [n for n in LABELS if n not in ("other", "python") and profile.stages[n] == 0]
     assert busy == []
     assert profile.compiled == 0
     assert profile.round_steps == 2  # one refresh of the occupancy grid
-    assert 0 < profile.rays <= 128 and profile.rays < profile.queries <= 1024
+    assert 0 < profile.rays < profile.queries <= trainer.config.sampling.batch
     rate = profile.queries * profile.flop_per_query / (profile.step_ms * 1e-3) / 1e9
     assert profile.gflops == pytest.approx(rate)
+
+
+def test_what_kernels_leave_is_python() -> None:
+    jit, gemm = dr.KernelType.JIT, dr.KernelType.BatchedGemm
+    launches = [
+        Launch(("network",), gemm, 1, "", 6.0, False),
+        Launch(("network", "encoding"), jit, 1, "", 2.0, False),
+        Launch(("occupancy", "network"), gemm, 1, "", 1.0, False),
+        Launch((), jit, 1, "", 1.0, False),
+    ]
+    kernels = {"products": 3.0, "encoding": 1.0, "occupancy": 0.5, "other": 0.5}
+    for step_ms, scale, python in ((8.0, 1.0, 3.0), (2.5, 0.5, 0.0)):
+        times = stage_times(launches, 2, step_ms)
+        assert {n: ms for n, ms in times.items() if ms and n != "python"} == pytest.approx(
+            {name: scale * ms for name, ms in kernels.items()}
+        )
+        assert times["python"] == pytest.approx(python, abs=1e-12)
 
 
 def test_the_table_shows_every_part() -> None:

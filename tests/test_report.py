@@ -167,6 +167,20 @@ def test_without_a_readable_checkpoint_the_profile_is_left_out(
         assert reason in (tmp_path / "out/report.md").read_text()
 
 
+def test_a_run_whose_data_is_gone(
+    run: Path, tmp_path: Path, refused: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, gone = json.loads((run / "config.json").read_text()), tmp_path / "gone"
+    config["data"]["path"] = str(gone)
+    (run / "config.json").write_text(json.dumps(config))
+    out = tmp_path / "out"
+    assert f"{gone}: no such dataset folder" in refused("report", run, "--out", out)
+    assert main(["report", str(run), "--out", str(out), "--point", "0", "0", "0.4"]) == 0
+    reason = f"{gone}: no such dataset folder"
+    assert f"no profile of training steps: {reason}" in capsys.readouterr().out
+    assert f"Left out: {reason}." in (out / "report.md").read_text()
+
+
 def test_bad_input(refused: Callable[..., str], run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     line = refused("report", run, "--out", out, "--point", "9", "0", "0")

@@ -12,7 +12,7 @@ from ..backend import choose_variant
 from ..report import report
 from ..report.profile import summary
 from ..target import open_target
-from .shared import Variant
+from .shared import Variant, progress_bar
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,15 @@ class Report:
 
     def run(self, _started: float) -> None:
         """Reports."""
-        record = report(
-            open_target(self.target),
-            self.out,
-            choose_variant(self.variant),
-            self.point,
-            profile=self.profile,
-        )
+        with progress_bar("report", "training step") as bar:
+            record = report(
+                open_target(self.target),
+                self.out,
+                choose_variant(self.variant),
+                self.point,
+                profile=self.profile,
+                on_step=bar.update,
+            )
         for entry in record["view_dependence"]:
             where = ", ".join(f"{v:.3f}" for v in entry["point"])
             print(f"({where}): deviation over directions {entry['deviation']:.3f}")

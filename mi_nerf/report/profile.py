@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -84,8 +85,13 @@ class _Round:
     launches: list[Launch]
 
 
-def profile_run(target: Target, variant: str) -> dict[str, Any]:
+def profile_run(
+    target: Target, variant: str, on_step: Callable[[], object] | None = None
+) -> dict[str, Any]:
     """Profiles steps of a run from its checkpoint on; nothing in its folder changes.
+
+    Args:
+        on_step: called after every step.
 
     Raises:
         InputError: if the target is a field file, or checkpoint or data cannot be read.
@@ -97,7 +103,7 @@ def profile_run(target: Target, variant: str) -> dict[str, Any]:
     dataset = load_dataset(target.data, "train", downscale=config.downscale, limit=config.views)
     trainer = Trainer(config, dataset, backend)
     load_checkpoint(target.path / CHECKPOINT, trainer)
-    profile = profile_steps(trainer)
+    profile = profile_steps(trainer, on_step=on_step)
     limits = {"drjit": drjit_product_rate(backend), "numpy": numpy_product_rate()}
     return asdict(profile) | {
         "gflops": profile.gflops,
@@ -107,27 +113,27 @@ def profile_run(target: Target, variant: str) -> dict[str, Any]:
     }
 
 
-def profile_steps(trainer: Trainer, budget: float = _BUDGET) -> StepProfile:
+def profile_steps(
+    trainer: Trainer, budget: float = _BUDGET, on_step: Callable[[], object] | None = None
+) -> StepProfile:
     """Trains on, for about ``budget`` seconds after a warm-up, and measures.
 
     Rounds with and without instrumentation take turns, so that both see the same machine.
+
+    Args:
+        on_step: called after every step.
     """
-    count, step_ms = _warm_up(trainer)
+    stopwatch = _Stopwatch(trainer, on_step or (lambda: None))
+    count, step_ms = stopwatch.warm_up()
     pairs = int(budget * 1e3 / (2 * count * step_ms))
-    plain, profiled = [_round(trainer, count)], []
+    plain, profiled = [stopwatch.plain_round(count)], []
     for _ in range(min(max(pairs, 1), _MOST_ROUNDS)):
-        profiled.append(_profiled_round(trainer, count))
-        plain.append(_round(trainer, count))
+        profiled.append(stopwatch.profiled_round(count))
+        plain.append(stopwatch.plain_round(count))
     kernels = [sum(k.milliseconds for k in r.launches) for r in profiled]
     typical = profiled[int(np.argsort(kernels)[len(kernels) // 2])]
     milliseconds = [r.milliseconds for r in plain]
     step_ms = float(np.median(milliseconds))
-    stages, launches = dict.fromkeys(LABELS, 0.0), dict.fromkeys(LABELS, 0.0)
-    for launch in typical.launches:
-        part = part_of_step(launch)
-        stages[part] += launch.milliseconds / count
-        launches[part] += 1 / count
-    stages["python"] = step_ms - sum(stages.values())
     return StepProfile(
         round_steps=count,
         rounds=len(plain),
@@ -135,8 +141,8 @@ def profile_steps(trainer: Trainer, budget: float = _BUDGET) -> StepProfile:
         fastest_ms=min(milliseconds),
         slowest_ms=max(milliseconds),
         profiled_ms=typical.milliseconds,
-        stages=stages,
-        launches=launches,
+        stages=stage_times(typical.launches, count, step_ms),
+        launches=_launch_counts(typical.launches, count),
         compiled=sum(k.compiled for r in profiled for k in r.launches),
         rays=float(np.mean([r.rays for r in plain])),
         queries=float(np.mean([r.queries for r in plain])),
@@ -153,41 +159,69 @@ def part_of_step(launch: Launch) -> str:
     return launch.stages[-1] if launch.stages else "other"
 
 
-def _warm_up(trainer: Trainer) -> tuple[int, float]:
-    """Trains until nothing is compiled any more; steps of a round, and milliseconds of one."""
-    step = _settled_round(trainer, 1)
-    options = trainer.config.occupancy
-    if not options.enabled or options.every * step.milliseconds > _BUDGET * 1e3:
-        return 1, step.milliseconds
-    return options.every, _settled_round(trainer, options.every).milliseconds
+def stage_times(launches: list[Launch], steps: int, step_ms: float) -> dict[str, float]:
+    """Milliseconds of each of ``LABELS`` in a step of ``step_ms``; they add up to it.
+
+    Args:
+        launches: of so many ``steps``, which need not be those that took ``step_ms``. Kernels
+            that took longer than that are scaled to fit.
+    """
+    parts = dict.fromkeys(LABELS, 0.0)
+    for launch in launches:
+        parts[part_of_step(launch)] += launch.milliseconds / steps
+    kernels = sum(parts.values())
+    scale = min(1.0, step_ms / kernels) if kernels > 0 else 1.0
+    parts = {name: scale * ms for name, ms in parts.items()}
+    return parts | {"python": step_ms - scale * kernels}
 
 
-def _settled_round(trainer: Trainer, count: int) -> _Round:
-    """The first round that compiles nothing, or the one after which patience ends."""
-    start = time.perf_counter()
-    while True:
-        seen = _profiled_round(trainer, count)
-        if time.perf_counter() - start > _WARM_UP or not any(k.compiled for k in seen.launches):
-            return seen
+def _launch_counts(launches: list[Launch], steps: int) -> dict[str, float]:
+    parts = [part_of_step(launch) for launch in launches]
+    return {name: parts.count(name) / steps for name in LABELS}
 
 
-def _profiled_round(trainer: Trainer, count: int) -> _Round:
-    with recording() as recorder:
-        seen = _round(trainer, count)
-    return _Round(seen.milliseconds, seen.rays, seen.queries, recorder.launches)
+class _Stopwatch:
+    """Takes training steps in rounds, each step waited for."""
 
+    def __init__(self, trainer: Trainer, on_step: Callable[[], object]) -> None:
+        self._trainer, self._on_step = trainer, on_step
 
-def _round(trainer: Trainer, count: int) -> _Round:
-    """``count`` steps, each waited for."""
-    seconds = rays = queries = 0.0
-    for _ in range(count):
+    def warm_up(self) -> tuple[int, float]:
+        """Trains until nothing is compiled any more; steps of a round, and ms of one."""
+        step = self._settled_round(1)
+        options = self._trainer.config.occupancy
+        if not options.enabled or options.every * step.milliseconds > _BUDGET * 1e3:
+            return 1, step.milliseconds
+        return options.every, self._settled_round(options.every).milliseconds
+
+    def plain_round(self, count: int) -> _Round:
+        """``count`` steps as they are."""
+        trainer, seconds = self._trainer, 0.0
+        rays = queries = 0.0
+        for _ in range(count):
+            start = time.perf_counter()
+            result = trainer.step(trainer.config.optimizer.lr_final)
+            dr.sync_thread()
+            seconds += time.perf_counter() - start
+            rays += float(result.rays[0])
+            queries += result.queries
+            self._on_step()
+        return _Round(1e3 * seconds / count, rays / count, queries / count, [])
+
+    def profiled_round(self, count: int) -> _Round:
+        """``count`` steps whose launches are recorded."""
+        with recording() as recorder:
+            seen = self.plain_round(count)
+        return replace(seen, launches=recorder.launches)
+
+    def _settled_round(self, count: int) -> _Round:
+        """The first round that compiles nothing, or the one after which patience ends."""
         start = time.perf_counter()
-        result = trainer.step(trainer.config.optimizer.lr_final)
-        dr.sync_thread()
-        seconds += time.perf_counter() - start
-        rays += float(result.rays[0])
-        queries += result.queries
-    return _Round(1e3 * seconds / count, rays / count, queries / count, [])
+        while True:
+            seen = self.profiled_round(count)
+            compiled = any(k.compiled for k in seen.launches)
+            if not compiled or time.perf_counter() - start > _WARM_UP:
+                return seen
 
 
 # ---------------------------------- Presentation ----------------------------------
@@ -233,9 +267,9 @@ def markdown(record: dict[str, Any]) -> list[str]:
     lines += [
         f"| a step | {total:.2f} | {100 * total / step_ms:.1f} % | {launched:.1f} |",
         "",
-        "Stages are measured on the device, by the times of their kernels, in other steps of which",
-        f"each stage waits for its kernels ({record['profiled_ms']:.2f} ms a step). A kernel is",
-        "part of the stage that launches it. Dr.Jit fuses what it can: rays are gathered in the",
+        "Stages are measured on the device, by the times of their kernels, in other steps, in",
+        f"which each stage waits for its kernels ({record['profiled_ms']:.2f} ms a step). A kernel",
+        "is part of the stage that launches it. Dr.Jit fuses what it can: rays are gathered in the",
         "kernel of the features, gradients of the samples in the first kernel of the network's",
         "adjoint. Matrix products, with the packing of their factors, are told by the type of the",
         "kernel. Python is what the kernels leave of the step. Neither padding of the last block",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ def report(
     points: Sequence[Point] = (),
     *,
     profile: bool = True,
+    on_step: Callable[[], object] | None = None,
 ) -> dict[str, Any]:
     """Writes ``report.json``, ``report.md`` and their plots.
 
@@ -37,6 +38,7 @@ def report(
         points: where to look at the emission over directions; without any, places that the
             run's training cameras see.
         profile: measure training steps; left out, with the reason, where that is impossible.
+        on_step: called after every training step.
 
     Returns:
         What ``report.json`` holds.
@@ -56,7 +58,7 @@ def report(
     }
     if profile:
         try:
-            record["step"] = step_profile.profile_run(target, variant)
+            record["step"] = step_profile.profile_run(target, variant, on_step)
             step_profile.draw(folder / step_profile.FIGURE, record["step"])
         except InputError as error:
             record["step_left_out"] = str(error)
