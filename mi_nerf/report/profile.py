@@ -50,7 +50,7 @@ class StepProfile:
     """Time and work of a step, averaged over rounds of ``round_steps`` steps.
 
     The stages are those of the profiled round whose kernels took the median time. They add
-    up to ``step_ms``, as Python is what the kernels leave of it.
+    up to ``step_ms`` (:func:`stage_times`).
     """
 
     round_steps: int  # one refresh of the occupancy grid falls into each, unless steps are slow
@@ -272,8 +272,9 @@ def markdown(record: dict[str, Any]) -> list[str]:
         "is part of the stage that launches it. Dr.Jit fuses what it can: rays are gathered in the",
         "kernel of the features, gradients of the samples in the first kernel of the network's",
         "adjoint. Matrix products, with the packing of their factors, are told by the type of the",
-        "kernel. Python is what the kernels leave of the step. Neither padding of the last block",
-        "nor queries of the occupancy grid count as arithmetic.",
+        "kernel. Python is what the kernels leave of the step; if they took longer there than the",
+        "step does here, as on a busy machine, they are scaled to fit. Neither padding of the last",
+        "block nor queries of the occupancy grid count as arithmetic.",
     ]
     return lines
 
