@@ -18,6 +18,7 @@ from .fused_network import FusedNetwork, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
 from .ndc import Ndc
 from .network import NetworkConfig
+from .stages import settled, stage
 
 Corner = tuple[float, float, float]
 ColorSpace = Literal["srgb", "linear"]
@@ -200,7 +201,8 @@ class NeuralField:
         """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
         config = self.config
         h = self._trunk(p)
-        direction = config.direction(d) if config.network.view_dependent else None
+        with stage("encoding"):
+            direction = settled(config.direction(d)) if config.network.view_dependent else None
         raw = network.color_head(config.network, self._weights, h, direction)
         return self._density(network.density_head(self._weights, h), p), self._color(raw)
 
@@ -222,7 +224,9 @@ class NeuralField:
         return density_emission
 
     def _trunk(self, p: Any) -> Any:
-        return network.trunk(self.config.network, self._weights, stack_rows(self._features(p)))
+        with stage("encoding"):
+            position = settled(stack_rows(self._features(p)))
+        return network.trunk(self.config.network, self._weights, position)
 
     def _features(self, p: Any) -> list[Any]:
         config = self.config

@@ -34,6 +34,7 @@ from .sampling import (
     points_along,
     stratified,
 )
+from .stages import stage
 
 # Samples of each ray that are evaluated before it is first asked whether the ray goes on.
 _FIRST_ROUND = 4
@@ -254,7 +255,8 @@ class Evaluation:
                     outputs = self._query(where, self._fused)
             for channel, value in zip(self._channels, outputs, strict=True):
                 dr.scatter(channel, dr.detach(value), where, valid)
-            dr.eval(self._channels, outputs)
+            with stage("scatter"):
+                dr.eval(self._channels, outputs)
         return index
 
     def _front_to_back(self, stop: float) -> Iterator[Any]:
@@ -301,7 +303,8 @@ class Evaluation:
     def backward(self) -> None:
         """Propagates the gradients of density and emission to the parameters."""
         gradients = [dr.grad(channel) for channel in self._channels]
-        dr.eval(gradients)
+        with stage("compositing"):  # its adjoint
+            dr.eval(gradients)
         kept = self._graph or ((w, v, None) for w, v in self._blocks(self.asked, self._block))
         with _private_sums():
             for where, valid, outputs in kept:
@@ -312,7 +315,8 @@ class Evaluation:
                         dr.accum_grad(value, dr.gather(type(value), gradient, where, valid))
                         dr.enqueue(dr.ADMode.Backward, value)
                 dr.traverse(dr.ADMode.Backward)
-                dr.eval([dr.grad(p) for p in self._field.parameters().values()])
+                with stage("encoding_adjoint"):
+                    dr.eval([dr.grad(p) for p in self._field.parameters().values()])
         self._graph = []
 
     def forward(self) -> None:
@@ -335,7 +339,8 @@ class Evaluation:
             slot = dr.arange(uint, size) + dr.opaque(uint, start)
             valid = slot < dr.opaque(uint, len(index))
             where = dr.gather(uint, index, slot, valid)
-            dr.eval(where, valid)
+            with stage("samples"):
+                dr.eval(where, valid)
             yield where, valid
 
     def _ranges(self, queries: int, block: int) -> Iterator[tuple[int, int]]:

@@ -1,4 +1,4 @@
-"""Reports: the emission of points over the hemisphere of directions."""
+"""Reports: emission over the hemisphere of directions, and the profile of a run's steps."""
 
 from __future__ import annotations
 
@@ -120,13 +120,65 @@ def test_deviation_measures_view_dependence(tmp_path: Path) -> None:
 
 def test_the_command(blob_run: Path, tmp_path: Path) -> None:
     points = ["--point", "0.1", "0.2", "0.3", "--point", "-0.2", "0", "0.1"]
-    assert main(["report", str(blob_run), "--out", str(tmp_path / "out"), *points]) == 0
+    out = ["--out", str(tmp_path / "out"), "--no-profile"]
+    assert main(["report", str(blob_run), *out, *points]) == 0
     record = json.loads((tmp_path / "out/report.json").read_text())
     found = [entry["point"] for entry in record["view_dependence"]]
     assert found == [[0.1, 0.2, 0.3], [-0.2, 0, 0.1]]
     text = (tmp_path / "out/report.md").read_text()
     assert "| 0.10, 0.20, 0.30 |" in text and "(view_dependence.png)" in text
     assert (tmp_path / "out/view_dependence.png").exists()
+    assert record["step"] is None and "Left out: not asked for." in text
+    assert not (tmp_path / "out/step_time.png").exists()
+
+
+def test_steps_of_a_run_are_measured_and_the_run_stays_as_it_is(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {path: path.read_bytes() for path in run.iterdir()}
+    assert (
+        main(["report", str(run), "--out", str(tmp_path / "out"), "--point", "0", "0", "0.4"]) == 0
+    )
+    assert {path: path.read_bytes() for path in run.iterdir()} == before
+    step = json.loads((tmp_path / "out/report.json").read_text())["step"]
+    assert sum(step["stages"].values()) == pytest.approx(step["step_ms"])
+    assert step["compiled"] == 0
+    best = max(step["product_gflops"].values())
+    assert step["share"] == pytest.approx(step["gflops"] / best) and 0 < step["share"] < 1
+    text = (tmp_path / "out/report.md").read_text()
+    assert "## Where a step's time goes" in text and "(step_time.png)" in text
+    assert iio.imread(tmp_path / "out/step_time.png").ndim == 3
+    assert f"a training step takes {step['step_ms']:.1f} ms" in capsys.readouterr().out
+
+
+def test_without_a_readable_checkpoint_the_profile_is_left_out(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    point = ["--point", "0", "0", "0.4"]
+    (run / "checkpoint.safetensors").write_bytes(b"damaged")
+    for target, reason in (
+        (run, f"{run / 'checkpoint.safetensors'}: "),
+        (run / "field.safetensors", "a field file, expected a run with its checkpoint"),
+    ):
+        assert main(["report", str(target), "--out", str(tmp_path / "out"), *point]) == 0
+        record = json.loads((tmp_path / "out/report.json").read_text())
+        assert record["step"] is None and reason in record["step_left_out"]
+        assert reason in capsys.readouterr().out
+        assert reason in (tmp_path / "out/report.md").read_text()
+
+
+def test_a_run_whose_data_is_gone(
+    run: Path, tmp_path: Path, refused: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, gone = json.loads((run / "config.json").read_text()), tmp_path / "gone"
+    config["data"]["path"] = str(gone)
+    (run / "config.json").write_text(json.dumps(config))
+    out = tmp_path / "out"
+    assert f"{gone}: no such dataset folder" in refused("report", run, "--out", out)
+    assert main(["report", str(run), "--out", str(out), "--point", "0", "0", "0.4"]) == 0
+    reason = f"{gone}: no such dataset folder"
+    assert f"no profile of training steps: {reason}" in capsys.readouterr().out
+    assert f"Left out: {reason}." in (out / "report.md").read_text()
 
 
 def test_bad_input(refused: Callable[..., str], run: Path, tmp_path: Path) -> None:

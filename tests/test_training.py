@@ -114,16 +114,20 @@ def test_incomplete_rays_do_not_count(views: Dataset) -> None:
     assert loss[1] == pytest.approx(error[:complete].mean(), rel=1e-5)
 
 
-def test_no_kernel_is_compiled_in_a_steady_state(data: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["nerf", "fast"])
+def test_no_kernel_is_compiled_in_a_steady_state(name: str, data: Path, tmp_path: Path) -> None:
     """In a process of its own, whose kernel cache starts empty."""
+    settings = SMALL + (["grid.levels=2", "grid.log2_entries=8"] if name == "fast" else [])
     script = f"""
 import sys
 sys.path.insert(0, {str(Path.cwd())!r})
 import drjit as dr, drjit.llvm.ad as ad
 from mi_nerf.data import load_dataset
 from mi_nerf.training.trainer import Trainer
-from tests.test_training import small
-trainer = Trainer(small(), load_dataset({str(data)!r}, "train"), ad)
+from mi_nerf.training.config import with_settings
+from mi_nerf.training.presets import preset
+config = with_settings(preset({name!r}), {settings!r})
+trainer = Trainer(config, load_dataset({str(data)!r}, "train"), ad)
 for _ in range(60):
     trainer.step(1e-2)
 dr.set_flag(dr.JitFlag.KernelHistory, True)
@@ -146,6 +150,7 @@ print(len(sizes), len(history), sum(not k["cache_hit"] for k in history))
     sizes, kernels, misses = map(int, output.stdout.split())
     assert sizes > 5 and kernels > 1000  # batches did change in size
     assert misses == 0
+    assert any((tmp_path / ".drjit").iterdir())  # the cache was this one
 
 
 def test_memory_stays_flat(views: Dataset) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import gather_vector3
 from ..cameras import pack_poses, pixel_rays
 from ..data import Dataset
+from ..stages import stage
 
 
 @dataclass
@@ -41,7 +42,8 @@ class RayBatch:
             take(self.alpha),
             [take(c) for c in self.background],
         )
-        dr.eval(part.o, part.d, part.color, part.alpha, part.background)
+        with stage("rays"):
+            dr.eval(part.o, part.d, part.color, part.alpha, part.background)
         return part
 
 

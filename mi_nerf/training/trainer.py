@@ -19,6 +19,7 @@ from ..errors import InputError
 from ..field import Corner, DensityNoise, NeuralField, NeuralFieldConfig
 from ..occupancy import OccupancyGrid, grid_shape
 from ..quadrature import Composite, over_background
+from ..stages import stage
 from ..volume import Evaluation, MarchSettings, Samples, integrate, place_samples, refine
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
@@ -175,11 +176,12 @@ class Trainer:
         rng = step_rng(float_type, config.seed, self.step_count)
         rays = self._ray_count()
         crop = config.crop if self.step_count < config.crop_steps else 1.0
-        batch = self._source.draw(rays, rng, crop)
-        jitter = rng.random(float_type, rays * config.sampling.samples)
         fine = config.sampling.fine
-        fine_jitter = rng.random(float_type, rays * fine) if fine else float_type()
-        dr.eval(jitter, fine_jitter)
+        with stage("rays"):
+            batch = self._source.draw(rays, rng, crop)
+            jitter = rng.random(float_type, rays * config.sampling.samples)
+            fine_jitter = rng.random(float_type, rays * fine) if fine else float_type()
+            dr.eval(jitter, fine_jitter)
         self.optimizer.zero_grad()
         with self._noise():
             parts = [
@@ -187,10 +189,12 @@ class Trainer:
                 for part in self._parts(rays)
             ]
         loss, mse, counted = (sum(v[1:], v[0]) for v in list(zip(*parts, strict=True))[:3])
-        accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
+        with stage("optimizer"):
+            accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
         self.step_count += 1
         self._adapt_rays(rays, sum(part[4] for part in parts))
-        self._refresh_occupancy()
+        with stage("occupancy"):
+            self._refresh_occupancy()
         return StepResult(loss, mse, accepted, counted, sum(part[3] for part in parts))
 
     def _parts(self, rays: int) -> Iterator[tuple[int, int]]:
@@ -237,35 +241,40 @@ class Trainer:
         sampling, share = self.config.sampling, part[1] / rays
         budget = math.ceil(sampling.batch * share)
         march = self.march_settings()
-        samples = place_samples(
-            self.field,
-            batch.o,
-            batch.d,
-            march,
-            occupancy=self.occupancy,
-            jitter=_rows(jitter, part, sampling.samples),
-        )
+        with stage("samples"):
+            samples = place_samples(
+                self.field,
+                batch.o,
+                batch.d,
+                march,
+                occupancy=self.occupancy,
+                jitter=_rows(jitter, part, sampling.samples),
+            )
         wanted = samples.queries
         complete = samples.truncate(budget)
         queries, passes = samples.queries, []
         if self.field.coarse is not None:
             coarse = self._evaluate(self.field.coarse, samples)
-            passes.append((coarse, integrate(coarse, samples)))
+            with stage("compositing"):
+                passes.append((coarse, integrate(coarse, samples)))
             offsets = _rows(fine_jitter, part, sampling.fine)
-            weights = passes[0][1].weights
-            samples = refine(samples, weights, sampling.fine, self.occupancy, offsets, march.hidden)
+            weights, fine = passes[0][1].weights, sampling.fine
+            with stage("samples"):
+                samples = refine(samples, weights, fine, self.occupancy, offsets, march.hidden)
             wanted += samples.queries
             complete = dr.minimum(complete, samples.truncate(max(1, budget - queries)))
             queries += samples.queries
         evaluation = self._evaluate(self.field, samples)
-        passes.append((evaluation, integrate(evaluation, samples)))
-        errors = [self._errors(batch, seen, complete, share) for _, seen in passes]
-        loss = sum((e for e, _ in errors), self._backend.Float(0))  # NeRF Eq. 6: of both
-        dr.backward(loss)
-        loss, mse = dr.detach(loss), errors[-1][1]
-        dr.eval(loss, mse, complete)
-        for evaluation, _ in passes:
-            evaluation.backward()
+        with stage("compositing"):
+            passes.append((evaluation, integrate(evaluation, samples)))
+            errors = [self._errors(batch, seen, complete, share) for _, seen in passes]
+            loss = sum((e for e, _ in errors), self._backend.Float(0))  # NeRF Eq. 6: of both
+            dr.backward(loss)
+            loss, mse = dr.detach(loss), errors[-1][1]
+            dr.eval(loss, mse, complete)
+        with stage("network"):
+            for evaluation, _ in passes:
+                evaluation.backward()
         return loss, mse, complete, queries, wanted
 
     def _evaluate(self, field: NeuralField, samples: Samples) -> Evaluation:
@@ -275,7 +284,8 @@ class Trainer:
             both = 2 * sampling.samples + sampling.fine
             block = min(block, math.ceil(sampling.batch * samples.count / both))
         tail = math.ceil(block / 4) if sampling.fine else block
-        evaluation = Evaluation(field, samples, block, keep=True, tail=tail)
+        with stage("network"):
+            evaluation = Evaluation(field, samples, block, keep=True, tail=tail)
         evaluation.enable_grad()
         return evaluation
 

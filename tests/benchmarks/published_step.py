@@ -4,9 +4,8 @@
     python -m tests.benchmarks.published_step --rays 4096 --steps 2
 
 One step of so many rays, with 64 queries of the coarse network and 192 of the fine one each:
-forward, backward, Adam. Prints the median
-of some steps after a warm-up, the arithmetic rate (3.49 MFLOP a query), and the rate of
-a plain matrix product of the same shape for comparison.
+forward, backward, Adam. Prints the median of some steps after a warm-up, the arithmetic rate
+(3.49 MFLOP a query), and the rate of a plain matrix product of the same shape for comparison.
 """
 
 from __future__ import annotations
@@ -22,12 +21,11 @@ import numpy as np
 from mi_nerf.backend import array_module, choose_variant
 from mi_nerf.cameras import Intrinsics, look_at
 from mi_nerf.data import Dataset
+from mi_nerf.report.arithmetic import drjit_product_rate, training_flop
 from mi_nerf.training.config import with_settings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.trainer import Trainer
 from tests.benchmarks import machine, resident_megabytes
-
-FLOP_PER_QUERY = 3.49e6
 
 
 def synthetic_views() -> Dataset:
@@ -57,7 +55,7 @@ def main() -> None:
         if step:  # the first one compiles
             seconds.append(time.perf_counter() - start)
     queries = result.queries
-    rate = queries * FLOP_PER_QUERY / np.median(seconds) / 1e9
+    rate = queries * training_flop(trainer.field_config) / np.median(seconds) / 1e9
     print(machine())
     weights = trainer.field_config.parameter_count()
     print(f"{result.rays} rays, {queries} queries, 2 x {weights} weights")
@@ -65,20 +63,7 @@ def main() -> None:
         f"step: median {np.median(seconds):.2f} s, {min(seconds):.2f} to {max(seconds):.2f} s, "
         f"{rate:.0f} GFLOP/s, {resident_megabytes() / 1e3:.1f} GB resident"
     )
-    print(f"plain matrix product 256x256x16384: {_product_rate(backend):.0f} GFLOP/s")
-
-
-def _product_rate(backend: object) -> float:
-    tensor = backend.TensorXf  # type: ignore[attr-defined]
-    rng = np.random.default_rng(0)
-    a, b = (tensor(rng.random((256, n), np.float32)) for n in (256, 16384))
-    best = np.inf
-    for _ in range(20):
-        start = time.perf_counter()
-        dr.eval(a @ b)
-        dr.sync_thread()
-        best = min(best, time.perf_counter() - start)
-    return 2 * 256 * 256 * 16384 / best / 1e9
+    print(f"plain matrix product 256x256x16384: {drjit_product_rate(backend):.0f} GFLOP/s")
 
 
 if __name__ == "__main__":
