@@ -55,7 +55,8 @@ def save_field(path: str | Path, contents: FieldFile) -> None:
         arrays |= {f"coarse.{name}": array for name, array in contents.coarse.items()}
     if contents.occupancy is not None:
         arrays["occupancy"] = np.packbits(contents.occupancy)
-    march = {k: getattr(contents.march, k) for k in ("samples", "fine", "near", "far", "stop")}
+    names = ("samples", "fine", "near", "far", "rule", "stop")
+    march = {name: getattr(contents.march, name) for name in names}
     description = {
         "field": {"kind": "neural", **dataclasses.asdict(contents.config)},
         "density_unit": "1/scene unit",

@@ -111,7 +111,8 @@ def _field_rows(path: Path, contents: FieldFile) -> dict[str, str]:
         "colour": f"{config.color_activation}, {config.color_space}",
         "box": f"{_corner(config.lower)} to {_corner(config.upper)}"
         + (", normalised device coordinates" if config.ndc is not None else ""),
-        "sampling": f"{march.samples} strata a ray, near {march.near}, far {march.far}",
+        "sampling": f"{march.samples} strata a ray, rule {march.rule}, "
+        f"near {march.near}, far {march.far}",
         "occupied": "no grid" if filled is None else f"{filled.mean():.1%} of {filled.shape}",
     }
 

@@ -196,14 +196,34 @@ def cell_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
     Returns:
         R·S widths ≥ 0 that sum to ``t_far − t_near``.
     """
+    below, above = half_widths(t, t_near, t_far, samples)
+    return below + above
+
+
+def half_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> tuple[Any, Any]:
+    """The parts of a sample's cell before and behind the sample; see :func:`cell_widths`."""
     float_type = type(t)
-    uint = dr.uint32_array_t(float_type)
-    index = dr.arange(uint, len(t))
+    index = dr.arange(dr.uint32_array_t(float_type), len(t))
     ray = index // samples
     within = index - ray * samples
-    last = uint(len(t) - 1)
-    before = dr.gather(float_type, t, dr.select(within > 0, index, 1) - 1)
-    after = dr.gather(float_type, t, dr.select(index < last, index + 1, last))
-    lower = dr.select(within > 0, 0.5 * (before + t), dr.gather(float_type, t_near, ray))
-    upper = dr.select(within < samples - 1, 0.5 * (t + after), dr.gather(float_type, t_far, ray))
-    return upper - lower
+    before, after = neighbours(t, samples)
+    to_near = t - dr.gather(float_type, t_near, ray)
+    to_far = dr.gather(float_type, t_far, ray) - t
+    below = dr.select(within > 0, 0.5 * (t - before), to_near)
+    return below, dr.select(within < samples - 1, 0.5 * (after - t), to_far)
+
+
+def neighbours(x: Any, samples: int, *, first: Any = None, last: Any = None) -> tuple[Any, Any]:
+    """The values of the samples before and behind each one, of R·S.
+
+    ``first`` and ``last`` (R·S values each) stand in where a ray begins and ends; by
+    default it is the sample's own value.
+    """
+    float_type = type(x)
+    index = dr.arange(dr.uint32_array_t(float_type), len(x))
+    within = index % samples
+    has_before, has_after = within > 0, within < samples - 1
+    before = dr.gather(float_type, x, dr.select(has_before, index, 1) - 1)
+    after = dr.gather(float_type, x, index + dr.select(has_after, 1, 0))
+    before = dr.select(has_before, before, x if first is None else first)
+    return before, dr.select(has_after, after, x if last is None else last)

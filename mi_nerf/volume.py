@@ -16,7 +16,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import drjit as dr
 
@@ -24,7 +24,7 @@ from .arrays import gather_vector3
 from .field import Field
 from .ndc import NdcRays
 from .occupancy import OccupancyGrid
-from .quadrature import Composite, composite, sample_weights
+from .quadrature import Composite, Rule, composite, sample_weights
 from .sampling import (
     box_interval,
     cell_widths,
@@ -51,6 +51,7 @@ class MarchSettings:
     fine: int = 0  # samples more, placed by the field's coarse network, if it has one
     near: float | None = None  # lower bound of t, in scene units; None: the box alone
     far: float | None = None  # upper bound of t
+    rule: Rule = "constant"  # of quadrature
     stop: float = 0.0  # a ray ends where less than this share of light passes; 0: never
     hidden: float = 0.0  # optical depth by the occupancy's floor that hides a sample; 0: none
     block: int = 16384  # queries a network evaluation
@@ -63,6 +64,8 @@ class MarchSettings:
         for name in ("fine", "hidden"):
             if getattr(self, name) < 0:
                 raise ValueError(f"{name}={getattr(self, name)}, expected 0 or more")
+        if self.rule not in get_args(Rule):
+            raise ValueError(f"rule='{self.rule}', expected {' or '.join(get_args(Rule))}")
         if not 0 <= self.stop < 1:
             raise ValueError(f"stop={self.stop}, expected 0 to less than 1")
         if self.near is not None and self.far is not None and not self.near < self.far:
@@ -84,6 +87,7 @@ class Samples:
     index: Any = None  # the M samples to evaluate, ascending
     coarse_queries: int = 0  # of the coarse network, by which the samples were placed
     ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
+    rule: Rule = "constant"
 
     @property
     def rays(self) -> int:
@@ -139,7 +143,11 @@ def place_samples(
         for limit in limits:
             near, far, hit = clip_interval(near, far, hit, *limit)
         t, delta = stratified(near, far, settings.samples, jitter)
-        samples = Samples(o, d, view, t, delta, settings.samples, near, far, ndc=ndc)
+        if settings.rule != "constant":
+            delta = cell_widths(t, near, far, settings.samples)
+        samples = Samples(
+            o, d, view, t, delta, settings.samples, near, far, ndc=ndc, rule=settings.rule
+        )
         samples = _select(samples, hit, occupancy, settings.hidden)
         coarse = getattr(field, "coarse", None)
         if coarse is None or not settings.fine:
@@ -393,8 +401,9 @@ def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
     Depth is a distance in scene space: in normalised device coordinates, that of the
     mean t'.
     """
+    ends = (samples.near, samples.far) if samples.rule == "linear" else None
     seen = composite(
-        evaluation.density, evaluation.emission, samples.t, samples.delta, samples.count
+        evaluation.density, evaluation.emission, samples.t, samples.delta, samples.count, ends
     )
     if samples.ndc is None:
         return seen

@@ -176,6 +176,7 @@ def test_names_cover_the_configuration() -> None:
         ("occupancy.every=0", "every=0, expected a number of at least 1"),
         ("occupancy.decay=1.5", "decay=1.5, expected a number of at least 0 and of at most 1"),
         ("sampling.samples=0", "samples=0, expected a number of at least 1"),
+        ("sampling.rule=cubic", "expected one of constant, cells, linear"),
         ("sampling.block=0", "block=0, expected a number of at least 1"),
         ("sampling.batch=5", "batch=5, expected at least the samples=64 of one ray"),
         ("density.gain=-1", "gain=-1.0, expected a number above 0"),

@@ -94,6 +94,7 @@ def test_other_colour_modes_are_refused(field: Path) -> None:
     ("integrator", "message"),
     [
         ({"samples": -1}, "samples=-1, expected 1 or more"),
+        ({"rule": "cubic"}, "rule='cubic', expected constant or cells or linear"),
         ({"aovs": "normal"}, "aov 'normal' is unknown, expected depth or opacity"),
     ],
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, get_args
 
 import drjit as dr
 import mitsuba as mi
@@ -12,7 +12,7 @@ from mitsuba.ad.integrators.common import ADIntegrator
 
 from ..color import srgb_to_linear
 from ..errors import InputError
-from ..quadrature import over_background
+from ..quadrature import Rule, over_background
 from ..volume import (
     Evaluation,
     MarchSettings,
@@ -55,6 +55,11 @@ class NerfIntegrator(ADIntegrator):
      * - near, far
        - |float|
        - Fixed bounds of the distance along the ray, in world units, within the box.
+         (Default: what the field file suggests)
+     * - rule
+       - |string|
+       - How density runs between samples: ``constant`` over strata, over ``cells`` that
+         reach halfway to the next sample, or ``linear`` from sample to sample.
          (Default: what the field file suggests)
      * - stop
        - |float|
@@ -106,6 +111,9 @@ class NerfIntegrator(ADIntegrator):
         if self.samples < 0:
             raise InputError(f"nerf: samples={self.samples}, expected 1 or more")
         self.near, self.far = props.get("near", None), props.get("far", None)
+        self.rule = props.get("rule", None)
+        if self.rule not in (None, *get_args(Rule)):
+            raise InputError(f"nerf: rule='{self.rule}', expected {' or '.join(get_args(Rule))}")
         self.stop = props.get("stop", None)
         if self.stop is not None and not 0 <= self.stop < 1:
             raise InputError(f"nerf: stop={self.stop}, expected 0 to less than 1")
@@ -124,6 +132,7 @@ class NerfIntegrator(ADIntegrator):
             "NerfIntegrator[\n"
             f"  samples = {self.samples or 'from field file'},\n"
             f"  near = {self.near}, far = {self.far},\n"
+            f"  rule = {self.rule or 'from field file'},\n"
             f"  stop = {'from field file' if self.stop is None else self.stop},\n"
             f"  jitter = {self.jitter},\n"
             f"  aovs = {self.aov_names()}\n"
@@ -271,7 +280,8 @@ class NerfIntegrator(ADIntegrator):
         march = placed.medium.march
         samples = self.samples or march.samples
         stop = march.stop if self.stop is None else self.stop
-        return replace(march, samples=samples, near=None, far=None, stop=stop)
+        rule = self.rule or march.rule
+        return replace(march, samples=samples, near=None, far=None, rule=rule, stop=stop)
 
     def _bounds(self, placed: PlacedField, ray: Any, scale: Any) -> tuple[Any, Any]:
         """Per-ray bounds of t in field units: the integrator's, the file's, the sensor's."""

@@ -13,6 +13,7 @@ from ..encoding import FourierEncoding
 from ..errors import InputError
 from ..hash_grid import HashGridConfig
 from ..network import NetworkConfig
+from ..quadrature import Rule
 from .plain import assign, build, leaf_names, require
 
 
@@ -61,6 +62,7 @@ class SamplingConfig:
     max_rays: int = 16384  # rays a step, at most
     render_stop: float = 1e-3  # transmittance at which a ray ends in evaluation; 0: never
     rays: int | None = None  # rays a step; none: as many as fill the batch
+    rule: Rule = "constant"  # of quadrature, in training and evaluation
     near: float | None = None  # fixed bounds instead of the box alone, scene units
     far: float | None = None
     block: int = 16384  # queries the network evaluates at a time

@@ -142,6 +142,7 @@ class Run:
                 fine=sampling.fine if sampling.render_fine is None else sampling.render_fine,
                 near=sampling.near,
                 far=sampling.far,
+                rule=sampling.rule,
                 stop=sampling.render_stop,
             ),
             {"mi_nerf": __version__, "preset": self.config.preset, "steps": trainer.step_count},

@@ -167,7 +167,12 @@ class Trainer:
         """How rays are sampled in training."""
         s = self.config.sampling
         return MarchSettings(
-            samples=s.samples, near=s.near, far=s.far, hidden=s.hidden, block=min(s.block, s.batch)
+            samples=s.samples,
+            near=s.near,
+            far=s.far,
+            rule=s.rule,
+            hidden=s.hidden,
+            block=min(s.block, s.batch),
         )
 
     def step(self, learning_rate: float) -> StepResult:

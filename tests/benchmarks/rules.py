@@ -1,0 +1,188 @@
+"""Errors of the rules of quadrature, at equal numbers of queries.
+
+    python -m tests.benchmarks.rules --plot rules.png
+    python -m tests.benchmarks.rules runs/lego --views 10
+
+Without a run: fields with known integrals in float64, 200 rays. Opacity is the same for all
+rules where samples lie in the middle of their strata; depth, the integral of an emission
+that grows with t, tells them apart. Then samples jittered as in training.
+
+With a run: rays of its held-out views, on white, against 4096 samples a ray of the same
+field, through the run's occupancy grid.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, get_args
+
+import drjit as dr
+import numpy as np
+
+from mi_nerf.backend import array_module, choose_variant
+from mi_nerf.data import load_dataset
+from mi_nerf.quadrature import Rule, over_background
+from mi_nerf.target import open_target
+from mi_nerf.training.batches import RayBatch, RaySource, step_rng
+from mi_nerf.volume import Evaluation, MarchSettings, integrate, place_samples
+from tests.benchmarks import machine
+from tests.test_closed_form import JUMPS, VALUES
+from tests.test_rules import errors
+
+RULES: tuple[Rule, ...] = get_args(Rule)
+FIELDS = {**VALUES, **{f"{kind}, edge 0": values for kind, values in JUMPS.items()}}
+DENSE = 4096
+RAYS_AT_A_TIME = 256  # with all of their samples
+
+
+def main() -> None:
+    """Prints the tables."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", nargs="?", help="folder of a run; by default, closed forms")
+    parser.add_argument("--plot", type=Path, help="picture of error against samples")
+    parser.add_argument("--split", default="val")
+    parser.add_argument("--views", type=int, default=10)
+    parser.add_argument("--rays", type=int, default=4096, help="drawn from the views")
+    parser.add_argument("--variant")
+    options = parser.parse_args()
+    variant = choose_variant(options.variant)
+    backend = array_module(variant)
+    print(f"{machine()}, {variant}\n")
+    if options.run is None:
+        closed_forms(backend, options.plot)
+    else:
+        trained(backend, options)
+
+
+# ---- Closed forms -------------------------------------------------------------
+
+
+def closed_forms(backend: Any, plot: Path | None) -> None:
+    """Errors at 64 and 192 samples, and the order of convergence from 64 to 768."""
+    columns: dict[str, Callable[[str, int], float]] = {
+        "opacity": lambda name, n: _errors(backend, name, "constant", n)[0],
+        **{
+            f"depth, {rule}": lambda name, n, rule=rule: _errors(backend, name, rule, n)[1]
+            for rule in ("constant", "linear")
+        },
+        **{
+            f"depth, jittered, {rule}": lambda name, n, rule=rule: _errors(
+                backend, name, rule, n, True
+            )[1]
+            for rule in RULES
+        },
+    }
+    samples = (64, 192, 768)
+    print("Errors at 64 and at 192 samples, and the order of convergence (from 64 to 768):\n")
+    print(f"| field | {' | '.join(columns)} |\n|{'---|' * (len(columns) + 1)}")
+    for name in FIELDS:
+        cells = []
+        for error in columns.values():
+            coarse, middle, fine = (error(name, n) for n in samples)
+            exact = coarse < 1e-12
+            order = "exact" if exact else f"{math.log(coarse / fine) / math.log(12):.1f}"
+            cells.append("exact" if exact else f"{coarse:.1e}, {middle:.1e}; {order}")
+        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+    if plot is not None:
+        _draw(plot, {c: f for c, f in columns.items() if c.startswith("depth")})
+
+
+def _errors(
+    backend: Any, name: str, rule: str, samples: int, jitter: bool = False
+) -> tuple[float, float]:
+    return errors(backend, name.split(",")[0], FIELDS[name], rule, samples, jitter)
+
+
+def _draw(path: Path, columns: dict[str, Callable[[str, int], float]]) -> None:
+    """Error of the depth against samples a ray, a panel for each field."""
+    from matplotlib.figure import Figure
+
+    samples = (16, 32, 64, 128, 256, 512, 1024)
+    figure = Figure(figsize=(12, 8.5), layout="constrained")
+    axes = figure.subplots(3, 4, sharex=True).ravel()
+    for name, axis in zip(FIELDS, axes, strict=False):
+        for column, error in columns.items():
+            style = "--" if "jittered" in column else "-"
+            axis.loglog(samples, [error(name, n) for n in samples], style, label=column)
+        axis.set_title(name)
+        axis.set_xlabel("samples a ray")
+        axis.set_ylabel("depth error, scene units")
+    axes[-1].set_axis_off()
+    axes[-1].legend(*axes[0].get_legend_handles_labels(), loc="center")
+    figure.savefig(path, dpi=110)
+
+
+# ---- Trained fields -------------------------------------------------------------
+
+
+def trained(backend: Any, options: argparse.Namespace) -> None:
+    """Mean absolute difference to the dense image, and PSNR lost against the truth."""
+    target = open_target(options.run)
+    if target.data is None:
+        raise SystemExit(f"{options.run}: expected the folder of a run, which knows its dataset")
+    views = load_dataset(
+        target.data, options.split, downscale=target.downscale, limit=options.views
+    )
+    source = RaySource(views, "white", backend.Float)
+    batch = source.draw(options.rays, step_rng(backend.Float, 0, 0))
+    field, occupancy = target.contents.build(backend)
+    march = replace(target.contents.march, fine=0, stop=0.0)
+
+    def image(rule: Rule, samples: int, jitter: bool = False) -> np.ndarray[Any, Any]:
+        settings = replace(march, samples=samples, rule=rule)
+        return _image(backend, field, occupancy, batch, settings, jitter)
+
+    dense = image("constant", DENSE)
+    truth = np.array(over_background(batch.color, batch.alpha, batch.background))
+    print(f"{options.run}: {options.rays} rays of {len(views)} views ({options.split}), on white.")
+    print(f"With {DENSE} samples {_psnr(dense, truth):.3f} dB; with fewer, mean absolute")
+    print("difference to that (in 1/255) and change of the PSNR:\n")
+    print("| samples | " + " | ".join(_columns()) + f" |\n|{'---|' * (len(_columns()) + 1)}")
+    for samples in (32, 64, 128, 256):
+        cells = []
+        for rule, jitter in _columns().values():
+            found = image(rule, samples, jitter)
+            off = 255 * np.abs(found - dense).mean()
+            cells.append(f"{off:.3f}, {_psnr(found, truth) - _psnr(dense, truth):+.3f} dB")
+        print(f"| {samples} | {' | '.join(cells)} |", flush=True)
+
+
+def _columns() -> dict[str, tuple[Rule, bool]]:
+    middle: tuple[Rule, ...] = ("constant", "linear")
+    return {
+        **{rule: (rule, False) for rule in middle},
+        **{f"jittered, {rule}": (rule, True) for rule in RULES},
+    }
+
+
+def _image(
+    backend: Any, field: Any, occupancy: Any, batch: RayBatch, march: MarchSettings, jitter: bool
+) -> np.ndarray[Any, Any]:
+    """(3, R) colours on white."""
+    parts, rng = [], np.random.default_rng(0)
+    rays = len(batch.alpha)
+    for start in range(0, rays, RAYS_AT_A_TIME):
+        part = batch.part(start, min(RAYS_AT_A_TIME, rays - start))
+        count = len(part.alpha) * march.samples
+        offsets = backend.Float(rng.random(count, np.float32)) if jitter else None
+        with dr.suspend_grad():
+            placed = place_samples(
+                field, part.o, part.d, march, occupancy=occupancy, jitter=offsets
+            )
+            seen = integrate(Evaluation(field, placed, march.block), placed)
+            parts.append(np.array(over_background(seen.color, seen.opacity, part.background)))
+    return np.concatenate(parts, axis=1)
+
+
+def _psnr(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
+    return -10 * math.log10(np.mean((a - b) ** 2, dtype=float))
+
+
+if __name__ == "__main__":
+    main()
