@@ -26,7 +26,9 @@ _LEAST_DEPTH = 1.0
 class Majorants:
     """Cells of an axis-aligned box with a density each; 0 where nothing is to be found."""
 
-    def __init__(self, lower: Any, upper: Any, values: np.ndarray[Any, Any], float_type: Any):
+    def __init__(
+        self, lower: Any, upper: Any, values: np.ndarray[Any, Any], float_type: Any
+    ) -> None:
         """
         Args:
             lower, upper: corners of the box, in scene units.
