@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from .arrays import upload, vector3_type
 from .field import Field
+from .occupancy import OccupancyGrid
 from .volume import RaySegments, ray_segments
 
 Array = NDArray[np.float64]
@@ -61,6 +62,7 @@ def reference(
     o: Any,
     d: Any,
     *,
+    occupancy: OccupancyGrid | None = None,
     bounds: tuple[Any, Any] = (None, None),
     tolerance: float = 1e-5,
     intervals: int = 128,
@@ -74,8 +76,10 @@ def reference(
     4 · ``intervals`` may be missed.
 
     Args:
-        field: any field; cells that an occupancy grid marks as empty are looked at too.
-        o, d: origins and unit directions, in the field's coordinates.
+        field: any field.
+        occupancy: cells that it marks as empty are empty, as in renderings; without it, what
+            training never saw there counts as well.
+        o, d: R origins and unit directions, in the field's coordinates.
         bounds: lower and upper bound of the distance, in scene units: numbers, arrays of R
             values or ``None``.
         tolerance: of the opacity, of colours (relative to those above 1), and of the depth
@@ -94,7 +98,7 @@ def reference(
     if max_intervals < 4 * intervals:
         raise ValueError(f"max_intervals={max_intervals}, expected at least {4 * intervals}")
     with dr.suspend_grad():
-        march = _March(field, o, d, bounds, block)
+        march = _March(field, o, d, occupancy, bounds, block)
         estimate = _refined(march, tolerance, intervals, max_intervals)
     return _in_scene(estimate, march.segments)
 
@@ -173,12 +177,20 @@ def _in_scene(estimate: Reference, segments: RaySegments) -> Reference:
 class _March:
     """Rays through a field, ready to be marched along at any fineness."""
 
-    def __init__(self, field: Field, o: Any, d: Any, bounds: tuple[Any, Any], block: int) -> None:
+    def __init__(
+        self,
+        field: Field,
+        o: Any,
+        d: Any,
+        occupancy: OccupancyGrid | None,
+        bounds: tuple[Any, Any],
+        block: int,
+    ) -> None:
         self._float = type(o[0])
+        self._occupancy = occupancy
         self._block = block
         fused = getattr(field, "fused", None)
-        self._fused: Ask | None = None if fused is None else fused()
-        self._ask: Ask = self._fused or field.density_emission
+        self._ask: Ask = (None if fused is None else fused()) or field.density_emission
         double = dr.float64_array_t(self._float)
         vector3 = vector3_type(double)
         limits = tuple(b if b is None or isinstance(b, int | float) else double(b) for b in bounds)
@@ -241,6 +253,9 @@ class _March:
             pad = np.minimum(np.arange(start, start + self._block), stop - 1)
             where, along = self._vectors(p[pad]), self._vectors(view[pad])
             sigma, color = self._ask(where, along)
+            if self._occupancy is not None:
+                seen = self._occupancy.occupied(self._occupancy.cell(where))
+                sigma = dr.select(seen, sigma, 0)
             dr.eval(sigma, color)
             n = stop - start
             density[start:stop] = np.array(sigma)[:n]

@@ -11,6 +11,7 @@ import pytest
 from mi_nerf.closed_form import closed_form
 from mi_nerf.field import NeuralField
 from mi_nerf.ndc import Ndc
+from mi_nerf.occupancy import OccupancyGrid
 from mi_nerf.reference import Reference, reference
 from mi_nerf.volume import MarchSettings, render_rays
 from tests import closed_forms as oracle
@@ -177,6 +178,19 @@ def test_bounds_and_blocks(ad: Any) -> None:
     o, d = (vectors(ad, v) for v in directed(10))
     whole, parts = (reference(fog, o, d, block=b, tolerance=1e-4) for b in (16384, 100))
     assert numbers(whole) == pytest.approx(numbers(parts), rel=1e-6, abs=1e-7)
+
+
+def test_cells_marked_as_empty_are_empty(ad: Any) -> None:
+    """Three of seven along the ray, whose ends are no ends of intervals."""
+    field = closed_form("slab", {"density": 0.9}, ad.TensorXf)
+    cells = np.ones((1, 1, 7), bool)
+    cells[..., [0, 3, 4]] = False
+    grid = OccupancyGrid(field.lower, field.upper, cells, ad.Float)
+    o, d = vectors(ad, [(0.1, 0.2, -3), (0.1, 0.2, 3)]), vectors(ad, [(0, 0, 1), (0, 0, -1)])
+    found = reference(field, o, d, occupancy=grid, max_intervals=4096)
+    exact = -np.expm1(-0.9 * 2 * 4 / 7)
+    assert (np.abs(found.opacity - exact) <= found.error[:, 3]).all()
+    assert found.error[:, 3].max() < 5e-3
 
 
 @pytest.mark.parametrize(
