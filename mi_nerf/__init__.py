@@ -1,7 +1,7 @@
 """Neural radiance fields as first-class citizens of Mitsuba 3.
 
-Importing the package registers the plugins ``nerf`` (integrator) and ``nerfmedium``
-(medium) with the active Mitsuba variant, and again whenever the variant changes.
+Importing the package registers the plugins ``nerf``, ``nerf_tracking`` (integrators) and
+``nerfmedium`` (medium) with the active Mitsuba variant, and again whenever the variant changes.
 """
 
 from __future__ import annotations

@@ -73,6 +73,41 @@ class MarchSettings:
 
 
 @dataclass
+class RaySegments:
+    """The parts of R rays o + t·d in which a field lies: near ≤ t ≤ far."""
+
+    o: Any  # R origins, in the space where the field lives
+    d: Any  # R unit directions in that space
+    view: Any  # R unit directions in scene space, along which the field emits
+    near: Any  # R bounds of t; both 0 where the field is missed
+    far: Any
+    hit: Any  # whether there is anything between them
+    ndc: NdcRays | None  # how o, d and t came about, where that is not scene space
+
+
+def ray_segments(field: Field, o: Any, d: Any, *limits: tuple[Any, Any]) -> RaySegments:
+    """Where the rays ``o + t·d`` (unit ``d``) are inside the field's box.
+
+    Rays are projected first where the field asks for it (NeRF, appendix C); those that do
+    not face forward see nothing then.
+
+    Args:
+        limits: pairs of further bounds of t, in scene units: numbers, R values or ``None``.
+    """
+    view, ndc = d, None
+    limits = limits or ((None, None),)  # without any, nothing behind the camera is seen either
+    if field.ndc is not None:
+        ndc = field.ndc.rays(o, d)
+        o, d, limits = ndc.o, ndc.d, tuple(ndc.bounds(*limit) for limit in limits)
+    near, far, hit = box_interval(o, d, field.lower, field.upper)
+    if ndc is not None:
+        hit &= ndc.facing
+    for limit in limits:
+        near, far, hit = clip_interval(near, far, hit, *limit)
+    return RaySegments(o, d, view, near, far, hit, ndc)
+
+
+@dataclass
 class Samples:
     """R·S samples of R rays, and which of them the field has to be asked about."""
 
@@ -127,28 +162,18 @@ def place_samples(
     """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
 
     ``jitter`` is passed on to :func:`mi_nerf.sampling.stratified`; ``bounds`` limits t
-    ray by ray, besides what ``settings`` say. Sample positions carry no gradient. Rays
-    are projected first where the field asks for it: samples are then evenly spread in
-    t' (NeRF, appendix C), and rays that do not face forward see nothing.
+    ray by ray, besides what ``settings`` say. Sample positions carry no gradient. In
+    normalised device coordinates samples are evenly spread in t' (NeRF, appendix C).
     """
-    view, ndc = d, None
-    limits = [(settings.near, settings.far), bounds or (None, None)]
     with dr.suspend_grad():
-        if field.ndc is not None:
-            ndc = field.ndc.rays(o, d)
-            o, d, limits = ndc.o, ndc.d, [ndc.bounds(*limit) for limit in limits]
-        near, far, hit = box_interval(o, d, field.lower, field.upper)
-        if ndc is not None:
-            hit &= ndc.facing
-        for limit in limits:
-            near, far, hit = clip_interval(near, far, hit, *limit)
+        within = ray_segments(field, o, d, (settings.near, settings.far), bounds or (None, None))
+        o, d, near, far = within.o, within.d, within.near, within.far
         t, delta = stratified(near, far, settings.samples, jitter)
         if settings.rule != "constant":
             delta = cell_widths(t, near, far, settings.samples)
-        samples = Samples(
-            o, d, view, t, delta, settings.samples, near, far, ndc=ndc, rule=settings.rule
-        )
-        samples = _select(samples, hit, occupancy, settings.hidden)
+        count, rule, ndc = settings.samples, settings.rule, within.ndc
+        samples = Samples(o, d, within.view, t, delta, count, near, far, ndc=ndc, rule=rule)
+        samples = _select(samples, within.hit, occupancy, settings.hidden)
         coarse = getattr(field, "coarse", None)
         if coarse is None or not settings.fine:
             return samples

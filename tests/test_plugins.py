@@ -216,11 +216,11 @@ def test_seed_and_spp(variant: str, field: Path) -> None:
 def test_passes_of_bounded_size_agree(
     variant: str, field: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import mi_nerf.plugins.integrator as integrator
+    import mi_nerf.plugins.camera as camera
 
     scene = mi.load_dict(scene_dict(field))
     whole = np.array(mi.render(scene, spp=512))
-    monkeypatch.setattr(integrator, "_RAYS_PER_PASS", 16 * 12 * 100)
+    monkeypatch.setattr(camera, "_RAYS_PER_PASS", 16 * 12 * 100)
     np.testing.assert_allclose(np.array(mi.render(scene, spp=512)), whole, atol=0.02)
 
 

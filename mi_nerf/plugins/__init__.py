@@ -1,4 +1,4 @@
-"""The Mitsuba plugins ``nerf`` (integrator) and ``nerfmedium`` (medium).
+"""The Mitsuba plugins ``nerf`` and ``nerf_tracking`` (integrators) and ``nerfmedium`` (medium).
 
 Plugin classes inherit from classes of the active Mitsuba variant, so the modules
 that define them are imported again whenever the variant changes.
@@ -11,7 +11,7 @@ import sys
 
 import mitsuba as mi
 
-_MODULES = ("medium", "integrator")
+_MODULES = ("medium", "camera", "integrator", "tracking")  # bases first
 _loaded_for: str | None = None
 _follows_variant = False
 

@@ -109,8 +109,8 @@ class NerfMedium(mi.Medium):
     coordinate system it fills all of z ≤ −1 that the views saw, up to infinity, for rays
     that descend along −z.
 
-    Only the integrator ``nerf`` shows it: Mitsuba's own volume integrators have no notion
-    of emission that depends on direction.
+    Only the integrators ``nerf`` and ``nerf_tracking`` show it: Mitsuba's own volume
+    integrators have no notion of emission that depends on direction.
 
     .. tabs::
         .. code-tab:: xml
