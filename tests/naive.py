@@ -29,6 +29,7 @@ class _RunningProduct(dr.CustomOp):
     """
 
     def eval(self, x: Any, samples: int) -> Any:
+        dr.make_opaque(x)  # Dr.Jit 1.5 crashes on products of a literal
         self._x, self._samples = x, samples
         self._product = dr.block_prefix_reduce(dr.ReduceOp.Mul, x, samples, exclusive=True)
         return self._product
@@ -42,9 +43,7 @@ class _RunningProduct(dr.CustomOp):
         return "RunningProduct"
 
 
-def product_weights(
-    density: Any, delta: Any, samples: int, pad: float = 1e-10
-) -> tuple[Any, Any]:
+def product_weights(density: Any, delta: Any, samples: int, pad: float = 1e-10) -> tuple[Any, Any]:
     """Weights α·Π(1 − α + pad), as in the code of the paper, and their sums."""
     alpha = one_minus_exp(density * delta)
     weights = alpha * dr.custom(_RunningProduct, 1 - alpha + pad, samples)
@@ -53,8 +52,9 @@ def product_weights(
 
 def endless(delta: Any, last: float = 1e10) -> Any:
     """Interval lengths of one ray of which the last has no end, as in the code of the paper."""
-    return dr.select(dr.arange(dr.uint32_array_t(type(delta)), len(delta)) < len(delta) - 1,
-                     delta, last)
+    return dr.select(
+        dr.arange(dr.uint32_array_t(type(delta)), len(delta)) < len(delta) - 1, delta, last
+    )
 
 
 def mean_distance(weights: Any, t: Any, samples: int) -> Any:
@@ -62,7 +62,7 @@ def mean_distance(weights: Any, t: Any, samples: int) -> Any:
     return dr.block_sum(weights * t, samples) / dr.block_sum(weights, samples)
 
 
-# ---- Networks (rows 6, 9, 10, 17) ----------------------------------------------
+# ---- Networks (rows 4, 6, 9, 10, 17) ----------------------------------------------
 
 
 def initial_weights(shapes: dict[str, tuple[int, ...]], seed: int) -> dict[str, np.ndarray]:
@@ -87,6 +87,11 @@ def doubled_sincos(x: Any, octave: int) -> tuple[Any, Any]:
 def plain_sincos(x: Any, octave: int) -> tuple[Any, Any]:
     """sin and cos of π·2^k·x as it stands."""
     return dr.sincos(x * (2.0**octave * math.pi))
+
+
+def clipped_exp(x: Any) -> Any:
+    """exp(x) up to x = 15, then constant: dead beyond."""
+    return dr.exp(dr.minimum(x, 15))
 
 
 def relu(x: Any) -> Any:
