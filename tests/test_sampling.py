@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-from fractions import Fraction
 from typing import Any
 
 import drjit as dr
@@ -14,22 +12,9 @@ from hypothesis import strategies as st
 
 from mi_nerf.sampling import box_interval, clip_interval, points_along, stratified
 from tests.arrays import vectors
+from tests.boxes import awkward_rays, slow_interval
 
 LOWER, UPPER = (-1.0, -0.5, -2.0), (1.0, 1.5, 0.25)
-
-
-def slow_interval(o: Any, d: Any, lower: Any, upper: Any) -> tuple[Fraction, Fraction] | None:
-    """Where one ray is inside the box at t ≥ 0, without rounding; None if nowhere."""
-    near, far = Fraction(0), None
-    for oi, di, low, high in zip(o, d, lower, upper, strict=True):
-        oi, di, low, high = (Fraction(float(v)) for v in (oi, di, low, high))
-        if di == 0:
-            if not low <= oi <= high:
-                return None
-            continue
-        first, second = sorted([(low - oi) / di, (high - oi) / di])
-        near, far = max(near, first), second if far is None else min(far, second)
-    return None if far is None or far <= near else (near, far)
 
 
 def fast_interval(
@@ -47,18 +32,8 @@ def fast_interval(
 
 
 def test_rays_that_meet_faces_edges_and_corners(ad: Any) -> None:
-    """Coordinates and slopes for which float32 makes no error: every bit must be right.
-
-    Origins lie before, on, inside and behind each pair of faces; directions are
-    parallel to faces, with zeros of both signs, or run exactly into edges and corners.
-    """
-    extent = zip(LOWER, UPPER, strict=True)
-    places = [(low - 1, low, (low + high) / 2, high, high + 0.5) for low, high in extent]
-    slopes = [0.0, -0.0, 1, -1, 0.5, -2]
-    origins = np.array(list(itertools.product(*places)), np.float32)
-    directions = np.array(list(itertools.product(slopes, repeat=3)), np.float32)
-    pairs = np.random.default_rng(0).permutation(len(origins) * len(directions))[:6000]
-    o, d = origins[pairs // len(directions)], directions[pairs % len(directions)]
+    """Coordinates and slopes for which float32 makes no error: every bit must be right."""
+    o, d = awkward_rays(LOWER, UPPER, 6000)
     near, far, hit = fast_interval(ad, o, d)
     slow = [slow_interval(*ray, LOWER, UPPER) for ray in zip(o, d, strict=True)]
     assert np.array_equal(hit, [interval is not None for interval in slow])

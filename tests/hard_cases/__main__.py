@@ -1,0 +1,42 @@
+"""``python -m tests.hard_cases``: both tables of docs/stability.md."""
+
+from __future__ import annotations
+
+import argparse
+import math
+
+from mi_nerf.backend import array_module, choose_variant
+from tests.hard_cases import fields
+from tests.hard_cases.cases import CASES
+
+
+def main() -> None:
+    """Measures every case."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--variant")
+    ad = array_module(choose_variant(parser.parse_args().variant))
+    print("| row | case | usual formula | measured | usual | mi_nerf | test |")
+    print("|---|---|---|---|---|---|---|")
+    for case in CASES:
+        head = f"| {case.row} | {case.name} | {case.naive} "
+        for finding in case.measure(ad):
+            print(
+                f"{head}| {finding.what} | {_number(finding.naive)} | {_number(finding.ours)} "
+                f"| `{case.test}` |"
+            )
+            head = "| | | "
+    print("\n| thickness of the sheet | 64 even samples | 192 even | 64 + 128 hierarchical |")
+    print("|---|---|---|---|")
+    for thickness in fields.THICKNESSES:
+        errors = [f"{opacity:.2g}" for opacity, _ in fields.sheet_errors(ad, thickness).values()]
+        print(f"| {thickness:g} | {' | '.join(errors)} |")
+
+
+def _number(value: float) -> str:
+    if not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "∞"
+    return "0" if value == 0 else f"{value:.3g}"
+
+
+if __name__ == "__main__":
+    main()
