@@ -65,19 +65,6 @@ def test_double_precision(ad: Any, convention: str) -> None:
     assert np.abs(error).max() <= 1e-13 + 1e-15 * turns
 
 
-def test_what_goes_wrong_without_the_reduction() -> None:
-    """The two usual ways, in float32: both are useless at k = 15."""
-    x, pi = POINTS.astype(np.float32), np.float32(math.pi)
-    exact = slow_sincos(x, range(15, 16), "pi")[0, 0]
-    assert np.abs(np.sin(x * np.float32(2**15) * pi) - exact).max() > 0.01
-
-    sine, cosine = np.sin(x * pi), np.cos(x * pi)
-    for _ in range(15):
-        sine, cosine = 2 * sine * cosine, cosine * cosine - sine * sine
-    assert sine.dtype == np.float32
-    assert np.abs(sine - exact).max() > 0.01
-
-
 # ---- Layout -----------------------------------------------------------------
 
 

@@ -62,17 +62,6 @@ def test_all_zero_weights_are_uniform() -> None:
     )
 
 
-def test_empty_bins_spread_instead_of_collapsing() -> None:
-    """The published code puts 30 of 61 samples of such bins on their left edges."""
-    weights = np.zeros((1, 64), np.float32)
-    weights[0, [3, 60]] = 1e-6, 1e-6  # of the order of the padding: most of the mass is empty
-    t = invert(weights, 256, 0.0, 64.0)[0]
-    within = t - np.floor(t)
-    assert np.unique(t).size == 256
-    assert (np.abs(within) < 1e-6).sum() <= 1
-    assert np.histogram(t, 64, (0, 64))[0].min() >= 3
-
-
 def test_ends_are_exact() -> None:
     """u in the first and the last instant of [0, 1), with sums that are not quite 1."""
     rng = np.random.default_rng(0)

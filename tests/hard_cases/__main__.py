@@ -34,7 +34,7 @@ def main() -> None:
 
 def _number(value: float) -> str:
     if not math.isfinite(value):
-        return "NaN" if math.isnan(value) else "∞"
+        return "NaN" if math.isnan(value) else "∞" if value > 0 else "−∞"
     return "0" if value == 0 else f"{value:.3g}"
 
 
