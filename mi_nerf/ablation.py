@@ -126,6 +126,8 @@ def ablate(
     for name in rows:
         if name not in ROWS:
             raise InputError(f"row '{name}': unknown, expected one of {', '.join(ROWS)}")
+    if config.preset == "auto":
+        raise InputError("preset 'auto': decides what rows differ in, expected nerf, fast or paper")
     folder = Path(out)
     base = complete(config)
     settings = {"data": str(Path(data).resolve()), "split": split, "views": views}

@@ -19,6 +19,7 @@ from .generation.run import RECORD, ceilings
 from .hash_grid import HashGridConfig
 from .tensor_file import read_metadata, read_tensors
 from .training import checkpoint
+from .training.auto import Decision
 from .training.run import CHECKPOINT, CONFIG, FIELD, read_config
 
 
@@ -78,7 +79,15 @@ def _run(folder: Path) -> str:
         rows |= _checkpoint_rows(folder / CHECKPOINT)
     if (folder / FIELD).exists():
         rows |= _field_rows(folder / FIELD, load_field(folder / FIELD))
-    return _table(rows)
+    return "\n".join([_table(rows), *_decisions(record)])
+
+
+def _decisions(record: dict[str, Any]) -> list[str]:
+    """Why preset ``auto`` chose what it did, a line for each setting."""
+    try:
+        return [f"auto: {Decision(**decision)}" for decision in record.get("auto", ())]
+    except TypeError:  # written by another version: not worth a refusal
+        return []
 
 
 def _checkpoint_rows(path: Path) -> dict[str, str]:

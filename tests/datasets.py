@@ -58,8 +58,13 @@ def orbit_poses(n: int, radius: float = 4.0, height: float = 1.0) -> np.ndarray:
     )
 
 
-def blob_images(poses: np.ndarray, size: int, angle_x: float) -> np.ndarray:
-    """A ball of radius 0.8 with a soft edge, coloured by its normal, straight RGBA uint8."""
+def blob_images(
+    poses: np.ndarray, size: int, angle_x: float, *, mirror: bool = False
+) -> np.ndarray:
+    """A ball of radius 0.8 with a soft edge, coloured by its normal, straight RGBA uint8.
+
+    With ``mirror`` it is coloured by the direction in which it reflects the ray instead.
+    """
     camera = Intrinsics.from_angle_x(size, size, angle_x)
     y, x = np.mgrid[:size, :size] + 0.5
     local = np.stack(
@@ -74,6 +79,8 @@ def blob_images(poses: np.ndarray, size: int, angle_x: float) -> np.ndarray:
         depth = 0.64 - (o @ o - b * b)  # below 0 where the ray misses
         normal = (o - d * (b + np.sqrt(np.maximum(depth, 0)))[..., None]) / 0.8
         alpha = np.clip(depth / 0.1, 0, 1)[..., None]
+        if mirror:
+            normal = d - 2 * (d * normal).sum(axis=-1, keepdims=True) * normal
         images.append(np.concatenate([np.clip(0.5 + 0.5 * normal, 0, 1), alpha], axis=-1))
     return np.rint(255 * np.array(images)).astype(np.uint8)
 

@@ -28,6 +28,8 @@ class Train:
 
     mi-nerf train lego/ --out runs/wide --set network.width=128 optimizer.lr=5e-3
 
+    mi-nerf train lego/ --out runs/chosen --preset auto --max-seconds 300
+
     mi-nerf train lego/ --out runs/lego --resume
     """
 
@@ -36,7 +38,7 @@ class Train:
     out: Path
     """Folder of the run; created."""
     preset: str = "nerf"
-    """Starting point of all settings: nerf, fast or paper."""
+    """Starting point of all settings: nerf, fast, paper, or auto to choose the model itself."""
     max_seconds: float | None = None
     """Stop after so many seconds of wall-clock time (default 600 if --steps is not given)."""
     steps: int | None = None
@@ -73,7 +75,10 @@ class Train:
             choose_variant(self.variant),
             resume=self.resume,
             started=started,
+            given={assignment.partition("=")[0] for assignment in self.set},
         )
+        for decision in run.decisions:
+            print(f"auto: {decision}")
         run.train()
         trainer = run.trainer
         hint = "" if run.progress >= 1 else "; stopped early, go on with --resume"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ..encoding import FourierEncoding
 from ..errors import InputError
 from ..hash_grid import HashGridConfig
@@ -56,7 +58,12 @@ def paper() -> TrainConfig:
     )
 
 
-PRESETS = {"nerf": nerf, "fast": fast, "paper": paper}
+def auto() -> TrainConfig:
+    """Where :mod:`mi_nerf.training.auto` starts from when a run chooses its own model."""
+    return replace(fast(), preset="auto")
+
+
+PRESETS = {"nerf": nerf, "fast": fast, "paper": paper, "auto": auto}
 
 
 def preset(name: str) -> TrainConfig:

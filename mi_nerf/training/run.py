@@ -6,7 +6,8 @@ import json
 import platform
 import time
 from collections import deque
-from dataclasses import replace
+from collections.abc import Collection
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from ..field_file import FieldFile, save_field
 from ..files import check_folder, make_folder, read_json, write_json
 from ..interrupts import interruptible
 from ..volume import MarchSettings
+from .auto import Decision, choose
 from .checkpoint import load_checkpoint, save_checkpoint
 from .config import TrainConfig, from_json, to_json
 from .progress import Meter, ProgressBar
@@ -53,6 +55,7 @@ class Run:
     ) -> None:
         """``started`` is the value of ``time.monotonic()`` from which seconds count."""
         self.folder, self.config, self.variant = folder, config, variant
+        self.decisions: list[Decision] = []  # why the configuration is what it is
         self._started = time.monotonic() if started is None else started
         self.trainer = Trainer(config, dataset, array_module(variant))
         self._blank = self.trainer.blank_loss
@@ -234,17 +237,21 @@ def start(
     *,
     resume: bool = False,
     started: float | None = None,
+    given: Collection[str] = (),
 ) -> Run:
     """Opens a run: a new one in an empty folder, or the one that is there with ``resume``.
 
     With ``resume`` the folder's own configuration holds; only ``steps`` and
-    ``max_seconds`` of ``config`` take its place, where given.
+    ``max_seconds`` of ``config`` take its place, where given. A new run with preset
+    ``auto`` first chooses its model, within its time but besides its steps; settings
+    named in ``given`` or unlike the preset's are kept.
 
     Raises:
         InputError: if the folder already holds a run, or the data cannot be read.
     """
     folder = Path(out)
-    if resume and (folder / CONFIG).exists():
+    recorded = resume and (folder / CONFIG).exists()
+    if recorded:
         config = _resumed_config(folder, config, data)
     elif resume and (folder / CHECKPOINT).exists():
         raise InputError(f"{folder}: no {CONFIG} beside the {CHECKPOINT}, expected both")
@@ -252,7 +259,12 @@ def start(
         raise InputError(f"{folder}: already holds a run, expected --resume or another folder")
     check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
+    decisions: list[Decision] = []
+    if config.preset == "auto" and not recorded:
+        started = time.monotonic() if started is None else started
+        config, decisions = choose(config, dataset, array_module(variant), given=given)
     run = Run(folder, config, dataset, variant, started=started)
+    run.decisions = decisions
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
         run.resume()
@@ -308,6 +320,7 @@ def _record(run: Run, dataset: Dataset) -> dict[str, Any]:
             "upper": field.upper,
             "parameters": field.parameter_count(),
         },
+        **({"auto": [asdict(d) for d in run.decisions]} if run.decisions else {}),
         "variant": run.variant,
         "versions": {
             "mi_nerf": __version__,

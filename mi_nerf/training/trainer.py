@@ -16,11 +16,19 @@ from .. import hull
 from ..data import Dataset
 from ..encoding import FourierEncoding
 from ..errors import InputError
-from ..field import Corner, DensityNoise, NeuralField, NeuralFieldConfig
+from ..field import Corner, DensityNoise, Field, NeuralField, NeuralFieldConfig
 from ..occupancy import OccupancyGrid, grid_shape
 from ..quadrature import Composite, over_background
 from ..stages import stage
-from ..volume import Evaluation, MarchSettings, Samples, integrate, place_samples, refine
+from ..volume import (
+    Evaluation,
+    MarchSettings,
+    Samples,
+    integrate,
+    place_samples,
+    refine,
+    render_rays,
+)
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
 from .losses import LOSSES, squared_error
@@ -89,6 +97,16 @@ def resolved_octaves(dataset: Dataset, lower: Corner, upper: Corner) -> int:
     return int(np.clip(round(math.log2(max(pixels, 2.0))), 1, 12))
 
 
+def carved_cells(
+    config: TrainConfig, dataset: Dataset, field: NeuralFieldConfig
+) -> np.ndarray[Any, Any]:
+    """The cells of the field's box that may hold something, (X, Y, Z) booleans."""
+    options = config.occupancy
+    if options.hull:
+        return hull.carve(dataset, field.lower, field.upper, options.resolution)
+    return np.ones(grid_shape(field.lower, field.upper, options.resolution), bool)
+
+
 def _require_memory(config: TrainConfig) -> None:
     """Refuses steps whose samples alone would not fit in memory."""
     sampling = config.sampling
@@ -113,16 +131,27 @@ def _rows(values: Any, part: tuple[int, int], count: int) -> Any:
 class Trainer:
     """Holds a field, its optimiser and its occupancy, and improves them step by step."""
 
-    def __init__(self, config: TrainConfig, dataset: Dataset, backend: Any) -> None:
-        """``backend`` is ``drjit.llvm.ad`` or ``drjit.cuda.ad``."""
+    def __init__(
+        self,
+        config: TrainConfig,
+        dataset: Dataset,
+        backend: Any,
+        cells: np.ndarray[Any, Any] | None = None,
+    ) -> None:
+        """
+        Args:
+            backend: ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+            cells: those that may hold something, (X, Y, Z) booleans; found if not given.
+        """
         self.config, self._backend = config, backend
         self.field_config = field_config(config, dataset)
-        self._hull = self._carve(dataset)
+        self._hull = carved_cells(config, dataset, self.field_config) if cells is None else cells
         background = config.background
         if background == "auto":
             background = "random" if dataset.has_alpha else "white"
         _require_memory(config)
         self._noise_level = 0.0 if dataset.has_alpha else config.density.noise
+        self.background = background
         self._source = RaySource(dataset, background, backend.Float)
         self.blank_loss = blank_loss(dataset, background)
         loss = config.loss
@@ -201,6 +230,17 @@ class Trainer:
         with stage("occupancy"):
             self._refresh_occupancy()
         return StepResult(loss, mse, accepted, counted, sum(part[3] for part in parts))
+
+    def validate(self, batch: RayBatch, field: Field | None = None) -> float:
+        """The loss over the pixels of ``batch``, by this field or another; changes nothing."""
+        march = replace(self.march_settings(), hidden=0.0, fine=self.config.sampling.fine)
+        with dr.suspend_grad():
+            seen = render_rays(
+                field or self.field, batch.o, batch.d, march, occupancy=self.occupancy
+            )
+            predicted = over_background(seen.color, seen.opacity, batch.background)
+            target = over_background(batch.color, batch.alpha, batch.background)
+            return float(dr.mean(self._loss(predicted, target))[0])
 
     def _parts(self, rays: int) -> Iterator[tuple[int, int]]:
         """Ranges of rays whose activations fit together in the memory set aside for them."""
@@ -306,13 +346,6 @@ class Trainer:
         loss = dr.sum(dr.select(used, self._loss(predicted, target), 0)) * weight
         mse = dr.sum(dr.select(used, dr.detach(squared_error(predicted, target)), 0)) * weight
         return loss, mse
-
-    def _carve(self, dataset: Dataset) -> np.ndarray[Any, Any]:
-        lower, upper = self.field_config.lower, self.field_config.upper
-        options = self.config.occupancy
-        if options.hull:
-            return hull.carve(dataset, lower, upper, options.resolution)
-        return np.ones(grid_shape(lower, upper, options.resolution), bool)
 
     def _ray_count(self) -> int:
         """Rays of the next step, in coarse steps so that arrays are seldom resized."""

@@ -1,0 +1,312 @@
+"""Preset ``auto``: the model a scene needs, from its data and a few short trainings.
+
+It starts from preset ``fast`` and departs from it only where there is a measured reason.
+What follows from the data alone (box, resolution, samples, batch, activations) is fixed
+first. Then probes answer, as long as their share of the budget lasts:
+
+1. Does colour depend on the direction of view? The same small model is trained with and
+   without directions, and the former judged again with its light averaged over directions.
+   Only if views that were held back look no worse in both ways do directions go.
+2. How wide, how deep? The network grows as long as that brings more, at the same number of
+   steps, than the smaller one would gain in the time that the larger one costs.
+3. A hash grid, or Fourier features alone? At the same number of steps.
+
+The seed fixes all chance in the probes. But how many steps there is time for and what a
+step costs are measured, so that another machine, or a busier one, may decide otherwise.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+from ..data import Dataset
+from . import probes
+from .config import TrainConfig, to_json, with_settings
+from .presets import nerf, preset
+from .probes import Probe, Probes
+from .trainer import carved_cells, field_config, resolved_octaves
+
+MARGIN = 0.05  # dB by which leaving something out has to win
+_SMALL_PROBE = ["grid.levels=6", "grid.log2_entries=14"]
+_SHAPES = ((1, 32), (1, 64), (2, 64), (2, 128))  # depth and width, as they grow
+_IN_DOUBT = (1, 64)  # that of preset ``fast``
+_FOURIER_COST = 6  # a step of Fourier features in steps of a small hash grid, at most
+_MEMORY_SHARE = 0.125  # of the machine's, for what one step keeps
+_BYTES_PER_QUERY = 8192  # activations, their gradients, samples: generous for a narrow network
+
+
+@dataclass(frozen=True)
+class Decision:
+    """One setting that was chosen, and why."""
+
+    setting: str
+    value: Any  # as JSON knows it
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.setting} = {_text(self.value)}: {self.reason}"
+
+
+def choose(
+    config: TrainConfig,
+    dataset: Dataset,
+    backend: Any,
+    *,
+    given: Collection[str] = (),
+    clock: Callable[[], float] = time.monotonic,
+) -> tuple[TrainConfig, list[Decision]]:
+    """The configuration for a dataset, and every setting that was chosen for it.
+
+    Args:
+        config: of preset ``auto``. What differs from the preset is kept.
+        given: names of settings that are kept even where they do not differ.
+        clock: seconds, as they count for ``config.max_seconds``.
+    """
+    choice = _Choice(config, set(given) | _changed(config))
+    _settle_data(choice, dataset)
+    field = field_config(choice.config, dataset)
+    cells = carved_cells(choice.config, dataset, field)
+    _settle_sampling(choice, float(cells.mean()))
+    if len(dataset) < probes.FEWEST_VIEWS:
+        choice.leave(f"{len(dataset)} views, too few to hold any back")
+    else:
+        _Questions(choice, Probes(choice.config, dataset, backend, cells, clock)).answer()
+    return choice.config, choice.decisions
+
+
+class _Choice:
+    """A configuration that takes shape."""
+
+    def __init__(self, config: TrainConfig, fixed: set[str]) -> None:
+        self.config, self._fixed = config, fixed
+        self.decisions: list[Decision] = []
+
+    def open(self, *prefixes: str) -> bool:
+        """Whether the user has left all settings alone whose names begin so."""
+        return not any(name.startswith(prefixes) for name in self._fixed)
+
+    def take(self, setting: str, value: Any, reason: str) -> None:
+        """Settles one setting, unless the user has."""
+        if self.open(setting):
+            self.config = with_settings(self.config, [f"{setting}={_text(value)}"])
+            self.decisions.append(Decision(setting, value, reason))
+
+    def leave(self, reason: str) -> None:
+        """Settles what probes were to answer in the way of preset ``fast``."""
+        network = self.config.network
+        for name in ("view_dependent", "depth", "width", "view_width"):
+            self.take(f"network.{name}", getattr(network, name), f"as in preset fast: {reason}")
+
+
+# ---- From the data alone ---------------------------------------------------------
+
+
+def _settle_data(choice: _Choice, dataset: Dataset) -> None:
+    """Box, resolution, and how colours and errors are expressed."""
+    config = choice.config
+    field = field_config(config, dataset)
+    if config.box is None:
+        how = "what the cameras see" if dataset.box is None else "the dataset's own box"
+        if dataset.has_alpha and config.occupancy.hull and dataset.ndc is None:
+            how += f", tightened to the silhouettes of {len(dataset)} views"
+        choice.take("box", [*field.lower, *field.upper], how)
+    octaves = resolved_octaves(dataset, field.lower, field.upper)
+    why = f"{octaves} octaves: the finest has a period of two pixels in the middle of the box"
+    if field.grid is not None:
+        choice.take("grid.finest", field.grid.finest, why)
+    elif choice.open("position"):
+        choice.take("position.frequencies", octaves, why)
+    linear = dataset.color_space == "linear"
+    targets = "linear images" if linear else "sRGB images"
+    if config.color_activation == "auto":
+        choice.take("color_activation", field.color_activation, targets)
+    if config.loss == "auto":
+        choice.take("loss", "relative" if linear else "mse", targets)
+    if config.background == "auto":
+        alpha = "images with alpha" if dataset.has_alpha else "images without alpha"
+        choice.take("background", "random" if dataset.has_alpha else "white", alpha)
+
+
+def _settle_sampling(choice: _Choice, occupied: float) -> None:
+    """Strata a ray and queries a step."""
+    grid = choice.config.grid
+    if grid is not None and grid.finest is not None:
+        samples = min(strata(grid.finest, occupied), choice.config.sampling.batch)
+        choice.take(
+            "sampling.samples",
+            samples,
+            f"the grid has {grid.finest} vertices along the box, "
+            f"{occupied:.0%} of which may hold something",
+        )
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    sampling = choice.config.sampling
+    batch = fitting_batch(sampling.batch, sampling.samples, memory)
+    choice.take(
+        "sampling.batch",
+        batch,
+        f"a step keeps {batch * _BYTES_PER_QUERY / 2**30:.2g} GiB at most "
+        f"of the machine's {memory / 2**30:.0f} GiB",
+    )
+
+
+def strata(finest: int, occupied: float) -> int:
+    """Strata a ray: one for two vertices of the finest grid, where not too much is evaluated.
+
+    Args:
+        finest: vertices along the box.
+        occupied: share of the box in which samples are evaluated at first.
+    """
+    affordable = 48 / max(occupied, 0.5)
+    return 64 if finest <= 128 else int(max(64, 16 * round(min(finest / 2, affordable) / 16)))
+
+
+def fitting_batch(wanted: int, samples: int, memory: int) -> int:
+    """Queries a step that keep no more than a fair part of ``memory`` bytes; a ray's at least."""
+    while wanted > samples and wanted * _BYTES_PER_QUERY > _MEMORY_SHARE * memory:
+        wanted //= 2
+    return max(wanted, samples)
+
+
+# ---- From probes ------------------------------------------------------------------
+
+
+class _Questions:
+    """What only training can tell; each answer is the ground for the next question."""
+
+    def __init__(self, choice: _Choice, runs: Probes) -> None:
+        self._choice, self._runs = choice, runs
+        self._grows = choice.open("network.depth", "network.width", "network.view_width")
+
+    def answer(self) -> None:
+        """Asks them all, as far as the budget goes."""
+        choice = self._choice
+        directions = choice.open("network.view_d")
+        features = choice.open("grid", "position") and choice.config.grid is not None
+        if not (directions or self._grows or features):
+            return
+        first = self._runs.train(self._small())
+        if first is None:
+            choice.leave("the budget is too short for probes")
+            return
+        base = self._directions(first) if directions else first
+        base = self._size(base) if self._grows else base
+        if features:
+            self._features(base)
+
+    def _small(self, *settings: str) -> TrainConfig:
+        """The model so far, in small where its size is still open."""
+        shape = _shape(*_SHAPES[0]) if self._grows else []
+        grid = _SMALL_PROBE if self._choice.config.grid and self._choice.open("grid.l") else []
+        return with_settings(self._choice.config, [*shape, *grid, *settings])
+
+    def _directions(self, seeing: Probe) -> Probe:
+        """Leaves directions out if that costs nothing; returns the probe of what remains."""
+        choice, setting = self._choice, "network.view_dependent"
+        blind = self._runs.train(self._small("network.view_dependent=false"), like=seeing)
+        if blind is None:
+            choice.take(setting, True, "as in preset fast: no time for a probe without")
+            return seeing
+        without, even = (q - seeing.quality for q in (blind.quality, seeing.averaged))
+        needless = min(without, even) >= 0 and without + even >= MARGIN
+        choice.take(
+            setting,
+            not needless,
+            f"{len(self._runs)} views held back have {seeing.quality:.2f} dB after "
+            f"{seeing.steps} steps with directions, {blind.quality:.2f} without, "
+            f"{seeing.averaged:.2f} with light averaged over them",
+        )
+        if not needless:
+            return seeing
+        choice.take("network.view_depth", 0, "layers behind the direction have nothing to add")
+        return blind
+
+    def _size(self, smallest: Probe) -> Probe:
+        """Grows the network while that pays; returns the probe of what it came to."""
+        best, shape, said = smallest, _SHAPES[0], [_report(_SHAPES[0], smallest)]
+        for larger in _SHAPES[1:]:
+            if not self._runs.affords(2 * best.steps * best.seconds, best.steps):
+                break
+            probe = self._runs.train(self._small(*_shape(*larger)), like=best)
+            if probe is None:
+                break
+            said.append(_report(larger, probe))
+            if not worth_growing(best, probe):
+                break
+            best, shape = probe, larger
+        if len(said) == 1:  # nothing to compare with
+            shape, said = _IN_DOUBT, ["as in preset fast: no time for a probe of another size"]
+        why = ", ".join(said)
+        for setting in _shape(*shape):
+            name, _, value = setting.partition("=")
+            self._choice.take(name, int(value), why)
+        return best
+
+    def _features(self, hashed: Probe) -> None:
+        """Fourier features alone, if they have learnt more in as many steps."""
+        choice = self._choice
+        why, probe = "as in preset fast: no time for a probe of Fourier features", None
+        if self._runs.affords(_FOURIER_COST * hashed.steps * hashed.seconds, hashed.steps):
+            trial = _Choice(choice.config, set())
+            _settle_fourier(trial, "")
+            probe = self._runs.train(trial.config, like=hashed)
+        if probe is not None:
+            why = (
+                f"after {hashed.steps} steps {hashed.quality:.2f} dB with a hash grid, "
+                f"{probe.quality:.2f} with Fourier features"
+            )
+            if probe.quality >= hashed.quality + MARGIN:
+                _settle_fourier(choice, why)
+                return
+        assert choice.config.grid is not None
+        choice.take("grid.levels", choice.config.grid.levels, why)
+
+
+def worth_growing(smaller: Probe, larger: Probe) -> bool:
+    """Whether the larger model gains more than the smaller one would in the same time."""
+    rivals = smaller.slope * math.log2(max(1.0, larger.seconds / smaller.seconds))
+    return larger.quality - smaller.quality > max(rivals, MARGIN)
+
+
+def _settle_fourier(choice: _Choice, why: str) -> None:
+    """The network of preset ``nerf`` in place of a hash grid."""
+    model, network = nerf(), nerf().network
+    choice.take("grid", None, why)
+    choice.take("position", None, why)
+    for name in ("depth", "width", "view_depth", "view_width"):
+        choice.take(f"network.{name}", getattr(network, name), why)
+    for name in ("batch", "hidden"):
+        choice.take(f"sampling.{name}", getattr(model.sampling, name), why)
+
+
+def _shape(depth: int, width: int) -> list[str]:
+    return [f"network.depth={depth}", f"network.width={width}", f"network.view_width={width}"]
+
+
+def _report(shape: tuple[int, int], probe: Probe) -> str:
+    return f"{shape[0]}x{shape[1]}: {probe.quality:.2f} dB at {1e3 * probe.seconds:.1f} ms a step"
+
+
+def _text(value: Any) -> str:
+    """A value as ``--set`` takes it."""
+    if isinstance(value, list):
+        return ",".join(map(_text, value))
+    return "none" if value is None else str(value).lower()
+
+
+def _changed(config: TrainConfig) -> set[str]:
+    """Names of the settings in which ``config`` differs from its preset."""
+    found, usual = (dict(_leaves(to_json(c))) for c in (config, preset(config.preset)))
+    return {name for name, value in found.items() if name not in usual or value != usual[name]}
+
+
+def _leaves(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
