@@ -143,7 +143,7 @@ def inverse_transform(
     u = dr.fmin(u, _BELOW_ONE)
     ray = dr.arange(uint, len(u)) // samples
     first = ray * bins
-    k = _count_below(start, u, first, bins, strict=False) - 1  # start is 0 in the first bin
+    k = count_below(start, u, first, bins, strict=False) - 1  # start is 0 in the first bin
     inside = (u - dr.gather(float_type, start, first + k)) / dr.gather(float_type, share, first + k)
     place = (float_type(k) + dr.clip(inside, 0, 1)) * (1 / bins)
     near, far = dr.gather(float_type, t_near, ray), dr.gather(float_type, t_far, ray)
@@ -168,13 +168,13 @@ def merge_sorted(a: Any, b: Any, count_a: int, count_b: int) -> Any:
     ):
         index = dr.arange(uint, len(own))
         ray = index // own_count
-        rank = _count_below(other, own, ray * other_count, other_count, strict)
+        rank = count_below(other, own, ray * other_count, other_count, strict)
         dr.scatter(merged, own, ray * count + (index - ray * own_count) + rank)
     dr.eval(merged)
     return merged
 
 
-def _count_below(row: Any, value: Any, first: Any, count: int, strict: bool) -> Any:
+def count_below(row: Any, value: Any, first: Any, count: int, strict: bool) -> Any:
     """How many of ``row[first … first + count]`` lie below (or at) ``value``."""
     float_type = type(row)
 
@@ -185,8 +185,19 @@ def _count_below(row: Any, value: Any, first: Any, count: int, strict: bool) -> 
     return dr.binary_search(0, count, below)
 
 
-def cell_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
-    """The part of each ray that belongs to each sample: up to halfway to its neighbours.
+def stratum_edges(t_near: Any, t_far: Any, samples: int) -> Any:
+    """The ends of equal strata: R·(S + 1) ascending parameters, of S strata a ray."""
+    float_type = type(t_near)
+    uint = dr.uint32_array_t(float_type)
+    index = dr.arange(uint, len(t_near) * (samples + 1))
+    ray = index // (samples + 1)
+    near, far = dr.gather(float_type, t_near, ray), dr.gather(float_type, t_far, ray)
+    share = float_type(index - ray * (samples + 1)) * (1 / samples)
+    return dr.select(share < 1, dr.fmin(dr.fma(share, far - near, near), far), far)
+
+
+def cell_edges(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
+    """The ends of what belongs to each sample, which is up to halfway to its neighbours.
 
     Args:
         t: R·S ascending parameters.
@@ -194,16 +205,26 @@ def cell_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
         samples: S.
 
     Returns:
-        R·S widths ≥ 0 that sum to ``t_far − t_near``.
+        R·(S + 1) ascending parameters, from ``t_near`` to ``t_far``.
     """
     float_type = type(t)
     uint = dr.uint32_array_t(float_type)
+    index = dr.arange(uint, len(t_near) * (samples + 1))
+    ray = index // (samples + 1)
+    within = index - ray * (samples + 1)
+    after = ray * samples + dr.fmin(within, samples - 1)
+    before = ray * samples + dr.fmax(within, 1) - 1
+    middle = 0.5 * (dr.gather(float_type, t, before) + dr.gather(float_type, t, after))
+    near, far = dr.gather(float_type, t_near, ray), dr.gather(float_type, t_far, ray)
+    return dr.select(within == 0, near, dr.select(within == samples, far, middle))
+
+
+def cell_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
+    """The lengths between :func:`cell_edges`: R·S widths ≥ 0 that sum to ``t_far − t_near``."""
+    float_type = type(t)
+    uint = dr.uint32_array_t(float_type)
+    edges = cell_edges(t, t_near, t_far, samples)
+    dr.eval(edges)
     index = dr.arange(uint, len(t))
-    ray = index // samples
-    within = index - ray * samples
-    last = uint(len(t) - 1)
-    before = dr.gather(float_type, t, dr.select(within > 0, index, 1) - 1)
-    after = dr.gather(float_type, t, dr.select(index < last, index + 1, last))
-    lower = dr.select(within > 0, 0.5 * (before + t), dr.gather(float_type, t_near, ray))
-    upper = dr.select(within < samples - 1, 0.5 * (t + after), dr.gather(float_type, t_far, ray))
-    return upper - lower
+    first = index + index // samples
+    return dr.gather(float_type, edges, first + 1) - dr.gather(float_type, edges, first)

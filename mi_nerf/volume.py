@@ -27,12 +27,14 @@ from .occupancy import OccupancyGrid
 from .quadrature import Composite, composite, sample_weights
 from .sampling import (
     box_interval,
+    cell_edges,
     cell_widths,
     clip_interval,
     inverse_transform,
     merge_sorted,
     points_along,
     stratified,
+    stratum_edges,
 )
 
 # Samples of each ray that are evaluated before it is first asked whether the ray goes on.
@@ -69,6 +71,41 @@ class MarchSettings:
 
 
 @dataclass
+class RaySegments:
+    """The parts of R rays o + t·d in which a field lies: near ≤ t ≤ far."""
+
+    o: Any  # R origins, in the space where the field lives
+    d: Any  # R unit directions in that space
+    view: Any  # R unit directions in scene space, along which the field emits
+    near: Any  # R bounds of t; both 0 where the field is missed
+    far: Any
+    hit: Any  # whether there is anything between them
+    ndc: NdcRays | None  # how o, d and t came about, where that is not scene space
+
+
+def ray_segments(field: Field, o: Any, d: Any, *limits: tuple[Any, Any]) -> RaySegments:
+    """Where the rays ``o + t·d`` (unit ``d``) are inside the field's box.
+
+    Rays are projected first where the field asks for it (NeRF, appendix C); those that do
+    not face forward see nothing then.
+
+    Args:
+        limits: pairs of further bounds of t, in scene units: numbers, R values or ``None``.
+    """
+    view, ndc = d, None
+    limits = limits or ((None, None),)  # without any, nothing behind the camera is seen either
+    if field.ndc is not None:
+        ndc = field.ndc.rays(o, d)
+        o, d, limits = ndc.o, ndc.d, tuple(ndc.bounds(*limit) for limit in limits)
+    near, far, hit = box_interval(o, d, field.lower, field.upper)
+    if ndc is not None:
+        hit &= ndc.facing
+    for limit in limits:
+        near, far, hit = clip_interval(near, far, hit, *limit)
+    return RaySegments(o, d, view, near, far, hit, ndc)
+
+
+@dataclass
 class Samples:
     """R·S samples of R rays, and which of them the field has to be asked about."""
 
@@ -83,6 +120,7 @@ class Samples:
     index: Any = None  # the M samples to evaluate, ascending
     coarse_queries: int = 0  # of the coarse network, by which the samples were placed
     ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
+    even: bool = True  # whether the intervals are equal strata of the ray
 
     @property
     def rays(self) -> int:
@@ -93,6 +131,12 @@ class Samples:
     def queries(self) -> int:
         """M."""
         return len(self.index)
+
+    def edges(self) -> Any:
+        """R·(S + 1) ascending ends of the intervals: sample s lies between s and s + 1."""
+        if self.even:
+            return stratum_edges(self.near, self.far, self.count)
+        return cell_edges(self.t, self.near, self.far, self.count)
 
     def truncate(self, budget: int) -> Any:
         """Keeps the first ``budget`` queries; returns how many rays keep all of theirs.
@@ -121,24 +165,15 @@ def place_samples(
     """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
 
     ``jitter`` is passed on to :func:`mi_nerf.sampling.stratified`; ``bounds`` limits t
-    ray by ray, besides what ``settings`` say. Sample positions carry no gradient. Rays
-    are projected first where the field asks for it: samples are then evenly spread in
-    t' (NeRF, appendix C), and rays that do not face forward see nothing.
+    ray by ray, besides what ``settings`` say. Sample positions carry no gradient. In
+    normalised device coordinates samples are evenly spread in t' (NeRF, appendix C).
     """
-    view, ndc = d, None
-    limits = [(settings.near, settings.far), bounds or (None, None)]
     with dr.suspend_grad():
-        if field.ndc is not None:
-            ndc = field.ndc.rays(o, d)
-            o, d, limits = ndc.o, ndc.d, [ndc.bounds(*limit) for limit in limits]
-        near, far, hit = box_interval(o, d, field.lower, field.upper)
-        if ndc is not None:
-            hit &= ndc.facing
-        for limit in limits:
-            near, far, hit = clip_interval(near, far, hit, *limit)
+        within = ray_segments(field, o, d, (settings.near, settings.far), bounds or (None, None))
+        o, d, near, far = within.o, within.d, within.near, within.far
         t, delta = stratified(near, far, settings.samples, jitter)
-        samples = Samples(o, d, view, t, delta, settings.samples, near, far, ndc=ndc)
-        samples = _select(samples, hit, occupancy, settings.hidden)
+        samples = Samples(o, d, within.view, t, delta, settings.samples, near, far, ndc=within.ndc)
+        samples = _select(samples, within.hit, occupancy, settings.hidden)
         coarse = getattr(field, "coarse", None)
         if coarse is None or not settings.fine:
             return samples
@@ -172,7 +207,12 @@ def refine(
         t = merge_sorted(samples.t, more, count, fine)
         delta = cell_widths(t, near, far, count + fine)
         merged = replace(
-            samples, t=t, delta=delta, count=count + fine, coarse_queries=samples.queries
+            samples,
+            t=t,
+            delta=delta,
+            count=count + fine,
+            coarse_queries=samples.queries,
+            even=False,
         )
         return _select(merged, far > near, occupancy, hidden)
 
@@ -291,7 +331,10 @@ class Evaluation:
             dr.enable_grad(channel)
 
     def backward(self) -> None:
-        """Propagates the gradients of density and emission to the parameters."""
+        """Propagates the gradients of density and emission to the parameters.
+
+        And to o, d, t and view of the samples, as far as gradients of these are enabled.
+        """
         gradients = [dr.grad(channel) for channel in self._channels]
         dr.eval(gradients)
         kept = self._graph or ((w, v, None) for w, v in self._blocks(self.asked, self._block))
@@ -304,11 +347,17 @@ class Evaluation:
                         dr.accum_grad(value, dr.gather(type(value), gradient, where, valid))
                         dr.enqueue(dr.ADMode.Backward, value)
                 dr.traverse(dr.ADMode.Backward)
-                dr.eval([dr.grad(p) for p in self._field.parameters().values()])
+                dr.eval([dr.grad(leaf) for leaf in self._leaves()])
         self._graph = []
 
+    def _leaves(self) -> list[Any]:
+        """All that gradients are added up for."""
+        samples = self._samples
+        moving = [v for v in (samples.o, samples.d, samples.view, samples.t) if dr.grad_enabled(v)]
+        return [*self._field.parameters().values(), *moving]
+
     def forward(self) -> None:
-        """Fills the gradients of density and emission from those of the parameters."""
+        """Fills the gradients of density and emission from those of what :meth:`backward` reaches."""
         tangents = [dr.zeros(type(c), len(c)) for c in self._channels]
         for where, valid in self._blocks(self.asked, self._block):
             outputs = self._query(where)
@@ -387,6 +436,36 @@ def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
         return seen
     distance = samples.ndc.to_distance(seen.depth)
     return replace(seen, depth=dr.select(seen.opacity > 0, distance, 0))
+
+
+def density_gradient(field: Field, samples: Samples, index: Any, block: int) -> list[Any]:
+    """∇σ at the samples ``index``, zero at the others: three arrays of R·S values.
+
+    In the space where the field lives, 1/unit². It carries no gradient itself, and leaves
+    those of the field's parameters alone.
+
+    Args:
+        block: queries the network evaluates at a time.
+    """
+    float_type, uint = type(samples.t), type(index)
+    result = [dr.zeros(float_type, len(samples.t)) for _ in range(3)]
+    dr.make_opaque(result)
+    for start in range(0, len(index), block):
+        slot = dr.arange(uint, block) + dr.opaque(uint, start)
+        valid = slot < dr.opaque(uint, len(index))
+        where = dr.gather(uint, index, slot, valid)
+        t = dr.gather(float_type, dr.detach(samples.t), where)
+        o, d = dr.detach(samples.o), dr.detach(samples.d)
+        p = points_along(o, d, t, where // samples.count)
+        dr.eval(p, where, valid)
+        with dr.resume_grad(), dr.suspend_grad(*field.parameters().values()):
+            dr.enable_grad(p)
+            dr.backward(field.density(p))
+            gradient = dr.grad(p)
+        for channel, value in zip(result, gradient, strict=True):
+            dr.scatter(channel, value, where, valid)
+        dr.eval(result)
+    return result
 
 
 @dataclass

@@ -81,4 +81,5 @@ def scene_dict(
 
 def weight_keys(params: Any) -> list[str]:
     """The names of a field's tensors among a scene's parameters."""
-    return [k for k in params.keys() if "interior_medium" in k]  # noqa: SIM118
+    keys = [k for k in params.keys() if "interior_medium" in k]  # noqa: SIM118
+    return [k for k in keys if not k.endswith(".to_world")]

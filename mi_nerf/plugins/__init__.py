@@ -11,7 +11,7 @@ import sys
 
 import mitsuba as mi
 
-_MODULES = ("medium", "integrator")
+_MODULES = ("medium", "backdrop", "integrator")  # each before those that import it
 _loaded_for: str | None = None
 _follows_variant = False
 

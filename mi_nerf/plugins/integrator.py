@@ -1,42 +1,26 @@
-"""The ``nerf`` integrator: shows a radiance field by quadrature along camera rays."""
+"""The ``nerf`` integrator: radiance fields among surfaces, by quadrature along camera rays."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import ADIntegrator
 
-from ..color import srgb_to_linear
 from ..errors import InputError
-from ..quadrature import over_background
-from ..volume import (
-    Evaluation,
-    MarchSettings,
-    integrate,
-    place_samples,
-    ray_chunks,
-    slice_rays,
-)
-from .placement import PlacedField, find_field
+from ..volume import MarchSettings
+from .backdrop import Environment, SolidScene, Surfaces, check_nested, has_surfaces
+from .crossing import Marched
+from .placement import PlacedField, find_fields
+from .stage import Stage, Wave
 
 # Camera rays traced at a time; more samples per pixel take several passes.
 _RAYS_PER_PASS = 1 << 22
-_AOVS = ("depth", "opacity")
-
-
-@dataclass
-class _Wave:
-    """The camera rays of one pass, and what they returned."""
-
-    ray: Any
-    weight: Any
-    position: Any  # on the film
-    jitter: Any  # one offset a ray, or None
-    outputs: list[Any]  # R, G, B, opacity, depth
+_AOVS = ("depth", "opacity", "normal", "index")
+_AXES = (".X", ".Y", ".Z")
 
 
 class NerfIntegrator(ADIntegrator):
@@ -113,10 +97,35 @@ class NerfIntegrator(ADIntegrator):
         # Read by the base class in C++; kept here for the background.
         self.show_background = not bool(props.get("hide_emitters", False))
         self.aovs = _parse_aovs(str(props.get("aovs", "")))
+        self.nested = self._find_nested(props)
+        self._solid, self._warned = SolidScene(), False
+
+    @staticmethod
+    def _find_nested(props: mi.Properties) -> Any:
+        """The integrator among the properties, or ``None``."""
+        found = [(key, props[key]) for key in props.unqueried()]
+        found = [(key, value) for key, value in found if isinstance(value, mi.Integrator)]
+        if len(found) > 1:
+            raise InputError(f"nerf: {len(found)} nested integrators, expected at most one")
+        for _, nested in found:
+            if isinstance(nested, NerfIntegrator):
+                raise InputError("nerf: nested in 'nerf', expected one like 'path' or 'prb'")
+            check_nested(nested)
+            return nested
+        return None
+
+    def traverse(self, callback: Any) -> None:
+        """Exposes the nested integrator."""
+        if self.nested is not None:
+            callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
     def aov_names(self) -> list[str]:
         """Names of the extra channels."""
-        return [name for name, _ in self.aovs]
+        return [
+            name + part
+            for name, kind in self.aovs
+            for part in (_AXES if kind == "normal" else ("",))
+        ]
 
     def to_string(self) -> str:
         """Lists the settings."""
@@ -126,7 +135,8 @@ class NerfIntegrator(ADIntegrator):
             f"  near = {self.near}, far = {self.far},\n"
             f"  stop = {'from field file' if self.stop is None else self.stop},\n"
             f"  jitter = {self.jitter},\n"
-            f"  aovs = {self.aov_names()}\n"
+            f"  aovs = {self.aov_names()},\n"
+            f"  nested = {self.nested}\n"
             "]"
         )
 
@@ -144,9 +154,9 @@ class NerfIntegrator(ADIntegrator):
         """Renders an image; see ``mi.render``."""
         sensor = _sensor(scene, sensor)
         with dr.suspend_grad():
-            placed = find_field(scene)
+            stage = self._stage(scene)
             waves = self._waves(scene, sensor, seed, spp)
-            image = self._develop(sensor.film(), self._traced(scene, placed, waves), develop)
+            image = self._develop(sensor.film(), _traced(stage, waves), develop)
             if evaluate and develop:
                 dr.eval(image)
         return image
@@ -160,7 +170,7 @@ class NerfIntegrator(ADIntegrator):
         seed: Any = 0,
         spp: int = 0,
     ) -> None:
-        """Carries the gradient of an image to the weights of the field.
+        """Carries the gradient of an image to the parameters of fields, surfaces and lights.
 
         First to the values of the camera rays, through reconstruction filter and film,
         then chunk by chunk through quadrature and network: memory does not grow with
@@ -168,12 +178,11 @@ class NerfIntegrator(ADIntegrator):
         """
         sensor = _sensor(scene, sensor)
         with dr.suspend_grad():
-            placed = find_field(scene)
-            waves = list(self._traced(scene, placed, self._waves(scene, sensor, seed, spp)))
+            stage = self._stage(scene)
+            waves = list(_traced(stage, self._waves(scene, sensor, seed, spp)))
             with dr.resume_grad():
                 for wave in waves:
-                    for output in wave.outputs:
-                        dr.enable_grad(output)
+                    dr.enable_grad(wave.outputs)
                 image = self._develop(sensor.film(), waves, True)
                 dr.set_grad(image, grad_in)
                 dr.enqueue(dr.ADMode.Backward, image)
@@ -181,8 +190,8 @@ class NerfIntegrator(ADIntegrator):
                 adjoints = [[dr.grad(output) for output in wave.outputs] for wave in waves]
             dr.eval(adjoints)
             for wave, gradients in zip(waves, adjoints, strict=True):
-                for chunk in self._chunks(placed, wave):
-                    self._chunk_backward(scene, placed, wave, chunk, gradients)
+                dr.disable_grad(wave.outputs)
+                stage.backward(wave, gradients)
 
     def render_forward(
         self,
@@ -192,15 +201,13 @@ class NerfIntegrator(ADIntegrator):
         seed: Any = 0,
         spp: int = 0,
     ) -> Any:
-        """The derivative of an image along the gradients of the field's weights."""
+        """The derivative of an image along the gradients of the scene's parameters."""
         sensor = _sensor(scene, sensor)
         with dr.suspend_grad():
-            placed = find_field(scene)
-            waves = list(self._traced(scene, placed, self._waves(scene, sensor, seed, spp)))
+            stage = self._stage(scene)
+            waves = list(_traced(stage, self._waves(scene, sensor, seed, spp)))
             for wave in waves:
-                tangents = [dr.zeros(mi.Float, len(o)) for o in wave.outputs]
-                for chunk in self._chunks(placed, wave):
-                    self._chunk_forward(scene, placed, wave, chunk, tangents)
+                tangents = stage.forward(wave)
                 with dr.resume_grad():
                     for output, tangent in zip(wave.outputs, tangents, strict=True):
                         dr.enable_grad(output)
@@ -215,17 +222,52 @@ class NerfIntegrator(ADIntegrator):
     ) -> tuple[Any, Any, list[Any], Any]:
         """Radiance along single rays, for integrators that nest this one."""
         with dr.suspend_grad():
-            placed = find_field(scene)
             jitter = sampler.next_1d() if self.jitter else None
-            wave = _Wave(ray, None, None, jitter, [])
-            self._trace(scene, placed, wave)
-        color, opacity, depth = wave.outputs[:3], wave.outputs[3], wave.outputs[4]
-        aovs = self._aov_values(opacity, depth)
-        return mi.Color3f(*color), opacity > 0, aovs, None
+            wave = Wave(ray, None, None, jitter, sampler)
+            self._stage(scene).trace(wave)
+            shown = wave.shown()
+        return shown["color"], shown["alpha"] > 0, self._aov_values(shown), None
+
+    # ---------------------------------- Scene ----------------------------------
+
+    def _stage(self, scene: mi.Scene) -> Stage:
+        """The scene as it is now."""
+        fields = [
+            Marched(placed, self._march(placed), self.near, self.far)
+            for placed in find_fields(scene)
+        ]
+        normals = any(kind == "normal" for _, kind in self.aovs)
+        if normals and any(marched.field.ndc is not None for marched in fields):
+            raise InputError(
+                "nerf: aov 'normal' of a field in normalised device coordinates, expected none"
+            )
+        backdrop: Environment | Surfaces
+        if self.nested is None:
+            self._warn_of_surfaces(scene)
+            backdrop = Environment(scene, self.show_background)
+        else:
+            backdrop = Surfaces(self._solid.of(scene), self.nested, normals)
+        return Stage(fields, backdrop, normals)
+
+    def _march(self, placed: PlacedField) -> MarchSettings:
+        march = placed.medium.march
+        samples = self.samples or march.samples
+        stop = march.stop if self.stop is None else self.stop
+        return replace(march, samples=samples, near=None, far=None, stop=stop)
+
+    def _warn_of_surfaces(self, scene: mi.Scene) -> None:
+        if not self._warned and has_surfaces(scene):
+            mi.Log(
+                mi.LogLevel.Warn,
+                "nerf: the scene's surfaces and lights are left out without an integrator to "
+                'show them: nest one, as in <integrator type="nerf"><integrator type="path"/>'
+                "</integrator>",
+            )
+        self._warned = True
 
     # ---------------------------------- Camera rays ----------------------------------
 
-    def _waves(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Iterator[_Wave]:
+    def _waves(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Iterator[Wave]:
         """Camera rays, in passes of bounded size with seeds of their own."""
         film = sensor.film()
         spp = spp or sensor.sampler().sample_count()
@@ -239,139 +281,42 @@ class NerfIntegrator(ADIntegrator):
             ray, weight, position = self.sample_rays(scene, sensor, sampler)
             jitter = sampler.next_1d() if self.jitter else None
             dr.eval(ray, weight, position, jitter)
-            yield _Wave(ray, weight, position, jitter, [])
+            sampler.schedule_state()
+            dr.eval()
+            yield Wave(ray, weight, position, jitter, sampler)
 
     def _develop(self, film: mi.Film, waves: Any, develop: bool) -> Any:
         """Splats the rays' values through the film's reconstruction filter."""
         block = None
         for wave in waves:
             block = block or film.create_block()
-            r, g, b, opacity, depth = wave.outputs
+            shown = wave.shown()
             ADIntegrator._splat_to_block(
                 block,
                 film,
                 wave.position,
-                value=mi.Color3f(r, g, b) * wave.weight,
+                value=shown["color"] * wave.weight,
                 weight=1.0,
-                alpha=opacity,
-                aovs=self._aov_values(opacity, depth),
+                alpha=shown["alpha"],
+                aovs=self._aov_values(shown),
                 wavelengths=wave.ray.wavelengths,
             )
             dr.eval(block.tensor())  # lets go of this pass before the next one
         film.put_block(block)
         return film.develop() if develop else None
 
-    def _aov_values(self, opacity: Any, depth: Any) -> list[Any]:
-        values = {"depth": depth, "opacity": opacity}
-        return [values[kind] for _, kind in self.aovs]
+    def _aov_values(self, shown: dict[str, Any]) -> list[Any]:
+        return [
+            value
+            for _, kind in self.aovs
+            for value in (shown[kind] if kind == "normal" else [shown[kind]])
+        ]
 
-    # ---------------------------------- Field ----------------------------------
 
-    def _march(self, placed: PlacedField) -> MarchSettings:
-        march = placed.medium.march
-        samples = self.samples or march.samples
-        stop = march.stop if self.stop is None else self.stop
-        return replace(march, samples=samples, near=None, far=None, stop=stop)
-
-    def _bounds(self, placed: PlacedField, ray: Any, scale: Any) -> tuple[Any, Any]:
-        """Per-ray bounds of t in field units: the integrator's, the file's, the sensor's."""
-        march = placed.medium.march
-        near = mi.Float(march.near or 0) if self.near is None else self.near * scale
-        far = mi.Float(dr.inf if march.far is None else march.far)
-        if self.far is not None:
-            far = self.far * scale
-        return near, dr.fmin(far, ray.maxt * scale)
-
-    def _traced(self, scene: mi.Scene, placed: PlacedField, waves: Any) -> Iterator[_Wave]:
-        for wave in waves:
-            self._trace(scene, placed, wave)
-            yield wave
-
-    def _trace(self, scene: mi.Scene, placed: PlacedField, wave: _Wave) -> None:
-        """Fills in ``wave.outputs``, without derivatives."""
-        rays = dr.width(wave.ray)
-        wave.outputs = [dr.zeros(mi.Float, rays) for _ in range(5)]
-        for chunk in self._chunks(placed, wave):
-            index, values, _ = self._render_chunk(scene, placed, wave, chunk)
-            for output, value in zip(wave.outputs, values, strict=True):
-                dr.scatter(output, value, index)
-            dr.eval(wave.outputs)
-
-    def _chunks(self, placed: PlacedField, wave: _Wave) -> Iterator[tuple[int, int]]:
-        return ray_chunks(dr.width(wave.ray), self._march(placed))
-
-    def _render_chunk(
-        self,
-        scene: mi.Scene,
-        placed: PlacedField,
-        wave: _Wave,
-        chunk: tuple[int, int],
-        mode: dr.ADMode = dr.ADMode.Primal,
-    ) -> tuple[Any, list[Any], Evaluation]:
-        """R, G, B, opacity and depth of some rays; leaves of the field are attached."""
-        index, o, d, jitter = slice_rays(wave.ray.o, wave.ray.d, wave.jitter, *chunk)
-        ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
-        ray.maxt = dr.gather(mi.Float, wave.ray.maxt, index)
-        local_o, local_d, scale = placed.to_local(ray.o, ray.d)
-        dr.eval(local_o, local_d, scale)
-        march, field = self._march(placed), placed.medium.field
-        samples = place_samples(
-            field,
-            local_o,
-            local_d,
-            march,
-            occupancy=placed.medium.occupancy,
-            jitter=jitter,
-            bounds=self._bounds(placed, ray, scale),
-        )
-        background = self._background(scene, ray)
-        with dr.resume_grad(when=mode != dr.ADMode.Primal):
-            stop = march.stop if mode == dr.ADMode.Primal else 0.0
-            evaluation = Evaluation(field, samples, march.block, stop=stop)
-            if mode != dr.ADMode.Primal:
-                evaluation.enable_grad()
-            if mode == dr.ADMode.Forward:
-                evaluation.forward()
-            seen = integrate(evaluation, samples)
-            color = _linear(seen.color, seen.opacity) if field.color_space == "srgb" else seen.color
-            values = over_background(color, seen.opacity, background)
-            values += [seen.opacity, seen.depth / scale]
-        return index, values, evaluation
-
-    def _chunk_backward(
-        self, scene: mi.Scene, placed: PlacedField, wave: _Wave, chunk: Any, gradients: list[Any]
-    ) -> None:
-        index, values, evaluation = self._render_chunk(
-            scene, placed, wave, chunk, dr.ADMode.Backward
-        )
-        with dr.resume_grad():
-            for value, gradient in zip(values, gradients, strict=True):
-                dr.set_grad(value, dr.gather(mi.Float, gradient, index))
-                dr.enqueue(dr.ADMode.Backward, value)
-            dr.traverse(dr.ADMode.Backward)
-            evaluation.backward()
-
-    def _chunk_forward(
-        self, scene: mi.Scene, placed: PlacedField, wave: _Wave, chunk: Any, tangents: list[Any]
-    ) -> None:
-        index, values, _ = self._render_chunk(scene, placed, wave, chunk, dr.ADMode.Forward)
-        with dr.resume_grad():
-            # The opacity is an output and an input of the colours: keep interior gradients.
-            dr.forward_to(values, flags=dr.ADFlag.ClearEdges)
-            slopes = [dr.grad(value) for value in values]
-        for tangent, slope in zip(tangents, slopes, strict=True):
-            dr.scatter(tangent, slope, index)
-        dr.eval(tangents)
-
-    def _background(self, scene: mi.Scene, ray: Any) -> list[Any]:
-        """Radiance of the environment emitter along rays, zero without one."""
-        emitter = scene.environment() if self.show_background else None
-        if emitter is None:
-            return [mi.Float(0)] * 3
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
-        si.wi = -ray.d
-        radiance = emitter.eval(si)
-        return [radiance.x, radiance.y, radiance.z]
+def _traced(stage: Stage, waves: Iterator[Wave]) -> Iterator[Wave]:
+    for wave in waves:
+        stage.trace(wave)
+        yield wave
 
 
 def _parse_aovs(text: str) -> list[tuple[str, str]]:
@@ -380,17 +325,11 @@ def _parse_aovs(text: str) -> list[tuple[str, str]]:
     for item in text.replace(" ", "").split(","):
         name, _, kind = item.rpartition(":")
         if item and kind not in _AOVS:
-            raise InputError(f"nerf: aov '{item}' is unknown, expected {' or '.join(_AOVS)}")
+            expected = ", ".join(_AOVS[:-1])
+            raise InputError(f"nerf: aov '{item}' is unknown, expected {expected} or {_AOVS[-1]}")
         if item:
             aovs.append((name or kind, kind))
     return aovs
-
-
-def _linear(color: list[Any], opacity: Any) -> list[Any]:
-    """Premultiplied linear radiance of premultiplied sRGB colour."""
-    visible = opacity > 0
-    inverse = dr.select(visible, 1 / dr.select(visible, opacity, 1), 0)
-    return [srgb_to_linear(c * inverse) * opacity for c in color]
 
 
 def _sensor(scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:

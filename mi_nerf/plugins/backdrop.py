@@ -1,0 +1,219 @@
+"""What stands in front of, among and behind the fields: surfaces, or only an environment."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+from mitsuba.ad.integrators.common import ADIntegrator, RBIntegrator
+
+from ..errors import InputError
+from .placement import is_field
+
+
+@dataclass
+class Behind:
+    """What camera rays meet where fields do not stop them."""
+
+    radiance: list[Any]  # R, G, B
+    valid: Any  # 1 where there is something opaque, to the film's alpha channel
+    distance: Any = None  # to the first surface, infinite where there is none; None: nowhere
+    normal: Any = None  # of that surface, in world coordinates; 0 where there is none
+    state: Any = None  # of the nested integrator, which some need for derivatives
+
+
+class Environment:
+    """The environment emitter, infinitely far away, or black."""
+
+    def __init__(self, scene: mi.Scene, visible: bool) -> None:
+        self._emitter = scene.environment() if visible else None
+
+    def look(self, ray: Any, sampler: Any) -> Behind:
+        """Radiance from along the rays."""
+        return Behind(self._radiance(ray), mi.Float(0))
+
+    def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
+        """Carries gradients of the radiance to the emitter."""
+        with dr.resume_grad():
+            _backward(self._radiance(ray), gradients)
+
+    def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
+        """The derivative of the radiance along the gradients of the emitter."""
+        with dr.resume_grad():
+            return _forward(self._radiance(ray))
+
+    def _radiance(self, ray: Any) -> list[Any]:
+        if self._emitter is None:
+            return [mi.Float(0)] * 3
+        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
+        si.wi = -ray.d
+        return list(self._emitter.eval(si))
+
+
+class Surfaces:
+    """All shapes but the cubes of fields, as a nested integrator shows them."""
+
+    def __init__(self, scene: mi.Scene, integrator: mi.SamplingIntegrator, normals: bool) -> None:
+        """
+        Args:
+            scene: without the cubes, see :class:`SolidScene`.
+            normals: whether normals are wanted.
+        """
+        self._scene, self._integrator, self._normals = scene, integrator, normals
+
+    def look(self, ray: Any, sampler: Any) -> Behind:
+        """What the nested integrator returns for the rays."""
+        distance, normal = self._first(ray)
+        radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler)
+        seen = Behind(list(radiance), dr.select(valid, mi.Float(1), 0), distance, normal, state)
+        dr.eval(seen.radiance, seen.valid, seen.distance, seen.normal, seen.state)
+        return seen
+
+    def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
+        """Carries gradients of the radiance to the parameters of surfaces and lights."""
+        if isinstance(self._integrator, RBIntegrator):
+            pull = mi.Color3f(*gradients)
+            self._sample(dr.ADMode.Backward, ray, sampler, pull, seen.state)
+            dr.eval()
+            return
+        with dr.resume_grad(), _differentiable_loops():
+            radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler)
+            _backward(list(radiance), gradients)
+
+    def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
+        """The derivative of the radiance along the gradients of surfaces and lights."""
+        if isinstance(self._integrator, RBIntegrator):
+            return list(self._sample(dr.ADMode.Forward, ray, sampler, None, seen.state)[0])
+        with dr.resume_grad(), _differentiable_loops():
+            radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler)
+            return _forward(list(radiance))
+
+    def _first(self, ray: Any) -> tuple[Any, Any]:
+        """Distance to the first surface, infinite without one, and its normal."""
+        if not self._normals:
+            pi = self._scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
+            return pi.t, mi.Normal3f(0)
+        si = self._scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=True)
+        return si.t, dr.select(si.is_valid(), si.sh_frame.n, 0)
+
+    def _sample(
+        self, mode: dr.ADMode, ray: Any, sampler: Any, pull: Any = None, state: Any = None
+    ) -> tuple[Any, Any, Any]:
+        """Radiance, validity and state; the same random numbers at every call."""
+        scene, sampler = self._scene, sampler.clone()
+        if not isinstance(self._integrator, ADIntegrator):
+            radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, True)
+            return radiance, valid, None
+        radiance, valid, _, state = self._integrator.sample(
+            mode=mode,
+            scene=scene,
+            sampler=sampler,
+            ray=ray,
+            depth=mi.UInt32(0),
+            δL=pull,
+            δaovs=None,
+            state_in=state,
+            active=mi.Bool(True),
+        )
+        return radiance, valid, state
+
+
+class SolidScene:
+    """A scene without the cubes of its fields; made again when shapes have changed.
+
+    A path tracer must not meet the cubes: even with a ``null`` BSDF they cast shadows on
+    whatever they contain.
+    """
+
+    def __init__(self) -> None:
+        self._made_of: list[Any] = []
+        self._scene: mi.Scene | None = None
+
+    def of(self, scene: mi.Scene) -> mi.Scene:
+        """The scene, less its cubes, in its present state."""
+        parts = [
+            part
+            for part in _Children.of(scene).values
+            if isinstance(part, mi.Shape | mi.Emitter) and not _holds_field(part)
+        ]
+        made_of = [v for part in parts for v in (part, *_Children.of(part).values)]
+        if self._scene is None or not _same(made_of, self._made_of):
+            props = mi.Properties("scene")
+            for i, part in enumerate(parts):
+                props[f"part_{i}"] = part
+            self._scene, self._made_of = mi.Scene(props), made_of
+        return self._scene
+
+
+def check_nested(integrator: Any) -> None:
+    """Refuses integrators that cannot say what is seen along a ray.
+
+    Raises:
+        InputError: naming the integrator.
+    """
+    name = integrator.class_name()
+    if not isinstance(integrator, mi.SamplingIntegrator):
+        raise InputError(
+            f"nerf: nested integrator '{name}' cannot look along single rays, "
+            "expected one like 'path' or 'prb'"
+        )
+    if integrator.aov_names():
+        raise InputError(
+            f"nerf: nested integrator '{name}' has channels of its own, "
+            "expected one like 'path' or 'prb', and 'aovs' on the integrator 'nerf'"
+        )
+
+
+def has_surfaces(scene: mi.Scene) -> bool:
+    """Whether a scene holds any shape but cubes of fields."""
+    return not all(_holds_field(shape) for shape in scene.shapes())
+
+
+def _holds_field(part: Any) -> bool:
+    return isinstance(part, mi.Shape) and is_field(part.interior_medium())
+
+
+class _Children(mi.TraversalCallback):
+    """Everything that an object says it consists of, without history."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.values: list[Any] = []
+
+    @classmethod
+    def of(cls, node: Any) -> _Children:
+        children = cls()
+        node.traverse(children)
+        return children
+
+    def put(self, name: str, value: Any, flags: Any = None) -> None:
+        """Called by the object."""
+        self.values.append(value)
+
+
+def _same(a: list[Any], b: list[Any]) -> bool:
+    return len(a) == len(b) and all(x is y for x, y in zip(a, b, strict=True))
+
+
+@contextmanager
+def _differentiable_loops() -> Iterator[None]:
+    """Loops step by step: recorded ones of Mitsuba's C++ integrators have no adjoint."""
+    with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
+        yield
+
+
+def _backward(values: list[Any], gradients: list[Any]) -> None:
+    for value, gradient in zip(values, gradients, strict=True):
+        if dr.grad_enabled(value):
+            dr.accum_grad(value, gradient)
+            dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward)
+
+
+def _forward(values: list[Any]) -> list[Any]:
+    dr.forward_to(values, flags=dr.ADFlag.ClearEdges)
+    return [dr.grad(value) for value in values]
