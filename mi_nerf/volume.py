@@ -357,12 +357,12 @@ class Evaluation:
         return [*self._field.parameters().values(), *moving]
 
     def forward(self) -> None:
-        """Fills the gradients of density and emission from those of what :meth:`backward` reaches."""
+        """Fills the gradients of density and emission from those that :meth:`backward` adds to."""
         tangents = [dr.zeros(type(c), len(c)) for c in self._channels]
         for where, valid in self._blocks(self.asked, self._block):
             outputs = self._query(where)
             # One output may be computed from another: keep the tangents of all.
-            dr.forward_to(outputs, flags=dr.ADFlag.ClearNone)
+            dr.forward_to(outputs, flags=dr.ADFlag.ClearNone | dr.ADFlag.AllowNoGrad)
             for tangent, value in zip(tangents, outputs, strict=True):
                 dr.scatter(tangent, dr.grad(value), where, valid)
             dr.eval(tangents)
@@ -460,7 +460,7 @@ def density_gradient(field: Field, samples: Samples, index: Any, block: int) -> 
         dr.eval(p, where, valid)
         with dr.resume_grad(), dr.suspend_grad(*field.parameters().values()):
             dr.enable_grad(p)
-            dr.backward(field.density(p))
+            dr.backward(field.density(p), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
             gradient = dr.grad(p)
         for channel, value in zip(result, gradient, strict=True):
             dr.scatter(channel, value, where, valid)

@@ -55,20 +55,7 @@ def scene_dict(
     return {
         "type": "scene",
         "integrator": {"type": "nerf", **(integrator or {})},
-        "sensor": {
-            "type": "perspective",
-            "fov": 40.0,
-            "to_world": view,
-            "film": {
-                "type": "hdrfilm",
-                "width": size[0],
-                "height": size[1],
-                "pixel_format": "rgba",
-                "rfilter": {"type": "box"},
-                **(film or {}),
-            },
-            "sampler": {"type": "independent", "sample_count": spp},
-        },
+        "sensor": camera_dict(view, size=size, film=film, spp=spp),
         "box": {
             "type": "cube",
             "to_world": transform,
@@ -76,6 +63,38 @@ def scene_dict(
             "interior": {"type": "nerfmedium", "filename": str(field)},
         },
         **objects,
+    }
+
+
+def camera_dict(
+    view: Any, *, size: tuple[int, int], film: dict[str, Any] | None = None, spp: int = 1
+) -> dict[str, Any]:
+    """A perspective camera of 40 degrees with an RGBA film."""
+    return {
+        "type": "perspective",
+        "fov": 40.0,
+        "to_world": view,
+        "film": {
+            "type": "hdrfilm",
+            "width": size[0],
+            "height": size[1],
+            "pixel_format": "rgba",
+            "rfilter": {"type": "box"},
+            **(film or {}),
+        },
+        "sampler": {"type": "independent", "sample_count": spp},
+    }
+
+
+def formula_dict(kind: str, to_world: Any = None, **numbers: Any) -> dict[str, Any]:
+    """A cube that holds a field given by a formula."""
+    import mitsuba as mi
+
+    return {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f() if to_world is None else to_world,
+        "bsdf": {"type": "null"},
+        "interior": {"type": "nerfmedium", "field": kind, **numbers},
     }
 
 

@@ -137,10 +137,11 @@ class SolidScene:
         """The scene, less its cubes, in its present state."""
         parts = [
             part
-            for part in _Children.of(scene).values
+            for part in _parts(scene)
             if isinstance(part, mi.Shape | mi.Emitter) and not _holds_field(part)
         ]
-        made_of = [v for part in parts for v in (part, *_Children.of(part).values)]
+        lights = [v for part in parts for v in _parts(part) if isinstance(v, mi.Emitter)]
+        made_of = [v for part in parts + lights for v in (part, *_parts(part))]
         if self._scene is None or not _same(made_of, self._made_of):
             props = mi.Properties("scene")
             for i, part in enumerate(parts):
@@ -178,25 +179,42 @@ def _holds_field(part: Any) -> bool:
 
 
 class _Children(mi.TraversalCallback):
-    """Everything that an object says it consists of, without history."""
+    """Takes down everything that an object says it consists of."""
 
-    def __init__(self) -> None:
+    def __init__(self, node: Any) -> None:
         super().__init__()
+        self._node = node
         self.values: list[Any] = []
 
-    @classmethod
-    def of(cls, node: Any) -> _Children:
-        children = cls()
-        node.traverse(children)
-        return children
-
-    def put(self, name: str, value: Any, flags: Any = None) -> None:
+    def put(self, name: str, value: Any, flags: Any = None, kind: Any = None) -> None:
         """Called by the object."""
-        self.values.append(value)
+        self.values.append(value if kind is None else mi.get_property(value, kind, self._node))
+
+
+def _parts(node: Any) -> list[Any]:
+    """Objects and values, without history, that an object consists of."""
+    children = _Children(node)
+    node.traverse(children)
+    return [dr.detach(value) for value in children.values]
 
 
 def _same(a: list[Any], b: list[Any]) -> bool:
-    return len(a) == len(b) and all(x is y for x, y in zip(a, b, strict=True))
+    """Whether lists hold the very same objects and arrays, not just equal ones."""
+    return len(a) == len(b) and all(
+        x is y or (type(x) is type(y) and _identity(x) == _identity(y))
+        for x, y in zip(a, b, strict=True)
+    )
+
+
+def _identity(value: Any) -> Any:
+    """What tells a value from all others that are alive."""
+    if isinstance(value, mi.Object):
+        return id(value)
+    if isinstance(value, mi.Transform4f):
+        value = value.matrix
+    if not dr.is_jit_v(value):
+        return value
+    return [_identity(v) for v in value] if dr.depth_v(value) > 1 else value.index
 
 
 @contextmanager
@@ -215,5 +233,5 @@ def _backward(values: list[Any], gradients: list[Any]) -> None:
 
 
 def _forward(values: list[Any]) -> list[Any]:
-    dr.forward_to(values, flags=dr.ADFlag.ClearEdges)
+    dr.forward_to(values, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
     return [dr.grad(value) for value in values]

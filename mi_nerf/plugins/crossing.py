@@ -138,7 +138,7 @@ class View:
         """The derivatives of ``values`` along the gradients of weights and places."""
         with dr.resume_grad():
             # The opacity is an output and an input of the colours: keep interior gradients.
-            dr.forward_to(self.values, flags=dr.ADFlag.ClearEdges)
+            dr.forward_to(self.values, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
             return [dr.grad(value) for value in self.values]
 
     def _look_at_one(self, crossing: _Crossing) -> None:
@@ -298,7 +298,8 @@ class _Moving:
     def forward(self) -> None:
         """Gives all copies the derivatives of their originals."""
         if self._pairs:
-            dr.forward_to([value for value, _ in self._pairs], flags=dr.ADFlag.ClearEdges)
+            values = [value for value, _ in self._pairs]
+            dr.forward_to(values, flags=dr.ADFlag.ClearEdges | dr.ADFlag.AllowNoGrad)
         for value, leaf in self._pairs:
             dr.set_grad(leaf, dr.grad(value))
 

@@ -66,14 +66,14 @@ class PlacedField:
 
 
 def find_fields(scene: mi.Scene) -> list[PlacedField]:
-    """The radiance fields of a scene, in the order of its shapes.
+    """The radiance fields of a scene, in the alphabetical order of their cubes' ids.
 
     Raises:
         InputError: if there is none, one is not in a cube or squashed flat, several include
             one in normalised device coordinates, or the scene holds a medium of another kind.
     """
     found = []
-    for shape in scene.shapes():
+    for shape in sorted(scene.shapes(), key=lambda shape: str(shape.id())):
         for medium in (shape.interior_medium(), shape.exterior_medium()):
             if medium is not None and not is_field(medium):
                 raise InputError(
