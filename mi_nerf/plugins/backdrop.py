@@ -75,6 +75,8 @@ class Surfaces:
 
     def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
         """Carries gradients of the radiance to the parameters of surfaces and lights."""
+        if not self._differentiable():
+            return
         if isinstance(self._integrator, RBIntegrator):
             pull = mi.Color3f(*gradients)
             self._sample(dr.ADMode.Backward, ray, sampler, pull, seen.state)
@@ -86,6 +88,8 @@ class Surfaces:
 
     def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
         """The derivative of the radiance along the gradients of surfaces and lights."""
+        if not self._differentiable():
+            return [dr.zeros(mi.Float, dr.width(ray))] * 3
         if isinstance(self._integrator, RBIntegrator):
             return list(self._sample(dr.ADMode.Forward, ray, sampler, None, seen.state)[0])
         with dr.resume_grad(), _differentiable_loops():
@@ -99,6 +103,11 @@ class Surfaces:
             return pi.t, mi.Normal3f(0)
         si = self._scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=True)
         return si.t, dr.select(si.is_valid(), si.sh_frame.n, 0)
+
+    def _differentiable(self) -> bool:
+        """Whether any parameter has a gradient: some integrators refuse to work without."""
+        with dr.resume_grad():
+            return bool(dr.grad_enabled([value for _, value in mi.traverse(self._scene)]))
 
     def _sample(
         self, mode: dr.ADMode, ray: Any, sampler: Any, pull: Any = None, state: Any = None

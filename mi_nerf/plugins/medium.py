@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -122,7 +123,7 @@ class NerfMedium(mi.Medium):
     ``vertex_positions``.
 
     Only the integrator ``nerf`` shows it: Mitsuba's own volume integrators have no notion
-    of emission that depends on direction.
+    of emission that depends on direction, and see a vacuum instead.
 
     .. tabs::
         .. code-tab:: xml
@@ -190,6 +191,21 @@ class NerfMedium(mi.Medium):
         """New weights may fill cells that were empty: the grid no longer holds."""
         if keys is None or any(k in self._names for k in keys):
             self._grid = None
+
+    # ---- What Mitsuba's own volume integrators find: nothing. Theirs would fail otherwise, ----
+    # ---- in any scene, as long as a field exists anywhere.                                 ----
+
+    def intersect_aabb(self, ray: Any) -> tuple[Any, Any, Any]:
+        """No ray meets anything."""
+        return mi.Bool(False), mi.Float(0), mi.Float(dr.inf)
+
+    def get_majorant(self, interaction: Any, active: Any = True) -> Any:
+        """Nothing scatters or absorbs."""
+        return mi.UnpolarizedSpectrum(0)
+
+    def get_scattering_coefficients(self, interaction: Any, active: Any = True) -> Any:
+        """Scattering, null and total coefficients: none."""
+        return tuple(mi.UnpolarizedSpectrum(0) for _ in range(3))
 
     def to_string(self) -> str:
         """Lists the settings."""
