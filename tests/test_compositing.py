@@ -10,7 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-import mi_nerf  # noqa: F401
+import mi_nerf
+from mi_nerf.ndc import Ndc
 from tests.fields import camera_dict, formula_dict, scene_dict, small_file
 
 VARIANTS = ["llvm_ad_rgb", pytest.param("cuda_ad_rgb", marks=pytest.mark.cuda)]
@@ -410,64 +411,176 @@ def test_normals_point_out_of_the_densest_place() -> None:
 # ---- Gradients ------------------------------------------------------------------
 
 
-def pull() -> np.ndarray:
-    """A weight for every number of an image with depth."""
-    return np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 5))
+def interlocked(nested: str, file: Path) -> Any:
+    """A network, two formulas and a wall through all of them, lit by a lamp.
 
-
-def loss(scene: Any, params: Any = None, seed: int = 7) -> Any:
-    """Σ pull · image, the same random numbers in image and derivative."""
-    image = mi.render(scene, params, seed=seed, seed_grad=seed + 1000, spp=4)
-    return dr.sum(image * mi.TensorXf(pull().astype(np.float32)), axis=None)
-
-
-def interlocked(nested: str, tmp_path: Path) -> Any:
-    """Two fields and a wall through both, lit by a lamp."""
-    file = small_file(tmp_path, density_activation="softplus", color_space="srgb")
-    move = place().translate([-0.4, 0.1, 0]).rotate([0, 0.6, 0.8], 20).scale([0.6, 0.5, 0.7])
-    box = {"type": "cube", "to_world": move, "interior": {"type": "nerfmedium"}}
-    box["interior"]["filename"] = str(file)
-    light = lamp(0.0, (6.0, 5.0, 4.0), half=0.7)
-    light["to_world"] = place().look_at(origin=[1, -3, 3], target=[0, 0, 0], up=[0, 0, 1]).scale(0.7)
+    All rays enter the network's box through the same face: at silhouettes of a box, finite
+    differences converge slowly.
+    """
+    move = place().translate([-0.4, 0.1, 0]).rotate([0, 0.6, 0.8], 20).scale([4, 0.5, 4])
+    light = lamp(0.0, (6.0, 5.0, 4.0))
+    light["to_world"] = place().look_at(origin=[1, -5, 3], target=[0, 0, 0], up=[0, 0, 1])
+    blob = formula_dict("gaussian", place().translate([0.2, 0.2, 0]), peak=2.0, width=0.3)
     return mi.load_dict(
         scene_of(
             nerf({"type": nested, "max_depth": 3}, aovs="depth"),
-            net=box,
-            fog=slab(place().translate([0.3, 0.3, 0]).scale([0.7, 0.6, 0.8]), 1.1, GLOW),
+            net={
+                "type": "cube",
+                "to_world": move,
+                "interior": {"type": "nerfmedium", "filename": str(file)},
+            },
+            blob=blob,
+            slab=slab(place().translate([0.3, 0.3, 0]).scale([0.7, 0.6, 0.8]), 1.1, GLOW),
             wall=wall(0.3),
             light=light,
         )
     )
 
 
-def check_slopes(scene: Any, change: Any, keys: list[str], step: float, rel: float) -> None:
-    """Derivatives along one number against central differences, in both modes.
+def turned(x: Any) -> Any:
+    """A move, a turn and a stretch at once, none for x = 0."""
+    move = mi.Transform4f().translate(mi.Vector3f(x, 0.5 * x, -x))
+    return move.rotate(mi.Vector3f(0, 0.6, 0.8), 40 * x).scale(mi.Vector3f(1 + x, 1, 1 - x))
 
-    ``change(x)`` sets the parameters of the scene for the number x.
-    """
+
+# What moves with x, the step of the finite difference, and the error allowed.
+CHANGES: dict[str, tuple[dict[str, Any], float, float]] = {
+    "weights": (
+        {
+            "net.interior_medium.density_bias": lambda v, x: v + x,
+            "net.interior_medium.color_bias": lambda v, x: v - 2 * x,
+            "slab.interior_medium.density": lambda v, x: v + x,
+        },
+        1e-2,
+        0.01,
+    ),
+    "place of a network": ({"net.interior_medium.to_world": lambda v, x: turned(x)}, 5e-4, 0.01),
+    "place of a formula": ({"blob.interior_medium.to_world": lambda v, x: turned(x)}, 3e-3, 0.01),
+    "place of a box": (
+        {"slab.interior_medium.to_world": lambda v, x: mi.Transform4f().scale(1 + x)},
+        5e-4,
+        0.05,
+    ),
+    "cube": (
+        {"blob.vertex_positions": lambda v, x: v + x * dr.tile(mi.Float(1, 0.5, -1), 24)},
+        3e-3,
+        0.01,
+    ),
+    "surface": (
+        {"wall.bsdf.reflectance.value": lambda v, x: v + mi.Color3f(x, 0, -x)},
+        0.05,
+        0.01,
+    ),
+    "light": (
+        {"light.emitter.radiance.value": lambda v, x: v + mi.Color3f(x, 0, 2 * x)},
+        0.5,
+        0.01,
+    ),
+    "all": (
+        {
+            "net.interior_medium.density_bias": lambda v, x: v + x,
+            "blob.interior_medium.to_world": lambda v, x: turned(x),
+            "light.emitter.radiance.value": lambda v, x: v + 3 * x,
+        },
+        1e-3,
+        0.02,
+    ),
+}
+
+
+@pytest.mark.parametrize("nested", ["path", "prb"])
+@pytest.mark.parametrize("kind", CHANGES)
+def test_gradients_agree_with_finite_differences(kind: str, nested: str, tmp_path: Path) -> None:
+    """Of a weighted sum of all channels, along one number x, in both modes."""
+    changes, step, tolerance = CHANGES[kind]
+    file = small_file(tmp_path, density_activation="softplus")
+    scene = interlocked(nested, file)
     params = mi.traverse(scene)
+    start = {key: params[key] + 0 if "to_world" not in key else None for key in changes}
+    pull = mi.TensorXf(np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 5)))
 
-    def at(x: float) -> float:
-        change(params, mi.Float(x))
+    def loss_at(x: Any, seed: int = 0, **options: Any) -> Any:
+        for key, change in changes.items():
+            params[key] = type(params[key])(change(start[key], x))
         params.update()
-        return float(loss(scene, seed=1007).array[0])
+        image = mi.render(scene, seed=seed, spp=4, **options)
+        return dr.sum(image * pull, axis=None)
 
-    x = mi.Float(0.0)
-    dr.enable_grad(x)
-    change(params, x)
+    def attached() -> Any:
+        x = mi.Float(0.0)
+        dr.enable_grad(x)
+        return x
+
+    ahead, behind = (float(loss_at(mi.Float(s * step), 7).array[0]) for s in (1, -1))
+    expected = (ahead - behind) / (2 * step)
+    x = attached()
+    dr.backward(loss_at(x, params=params, seed_grad=7))
+    assert float(dr.grad(x)[0]) == pytest.approx(expected, rel=tolerance)
+    y = attached()
+    loss = loss_at(y, params=params, seed_grad=7)
+    dr.forward(y)
+    assert float(dr.grad(loss).array[0]) == pytest.approx(float(dr.grad(x)[0]), rel=1e-3)
+
+
+# ---- Bad input ------------------------------------------------------------------
+
+
+def refused(**objects: Any) -> str:
+    """What is said about a scene; loading or rendering it fails."""
+    with pytest.raises(RuntimeError) as failure:
+        integrator = objects.pop("integrator", nerf())
+        render(scene_of(integrator, **objects))
+    return f"{failure.value} {failure.value.__cause__}"
+
+
+def test_bad_fields() -> None:
+    field = slab(place(), 1.0, GLOW)
+    medium = field["interior"]
+    assert "no 'nerfmedium', expected at least one, in a cube" in refused(wall=wall(0.0))
+    assert "'Sphere', expected a 'cube'" in refused(box={"type": "sphere", "interior": medium})
+    for scale in ([1, 1, 0], [1e-9, 1, 1]):
+        flat = place().scale(scale)
+        assert "cube's to_world is singular" in refused(box={**field, "to_world": flat})
+        inner = {**field, "interior": {**medium, "to_world": flat}}
+        assert "medium's to_world is singular" in refused(box=inner)
+    light = {"type": "area", "radiance": rgb(GLOW)}
+    assert "'box' is a light source" in refused(box={**field, "emitter": light})
+    missing = {"type": "cube", "interior": {"type": "nerfmedium", "filename": "none.safetensors"}}
+    assert "none.safetensors: not found" in refused(box=missing)
+
+
+def test_media_of_other_kinds_are_refused() -> None:
+    fog = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
+    ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog}
+    said = refused(box=slab(place(), 1.0, GLOW), ball=ball)
+    assert "shape 'ball' holds a medium of type 'HomogeneousMedium', expected" in said
+
+
+@pytest.mark.parametrize(
+    ("nested", "message"),
+    [
+        ({"type": "ptracer"}, "cannot look along single rays, expected one like 'path'"),
+        ({"type": "aov", "aovs": "z:depth"}, "has channels of its own"),
+        ({"type": "nerf"}, "nested in 'nerf', expected one like 'path'"),
+    ],
+)
+def test_nested_integrators_that_cannot_render(nested: dict[str, Any], message: str) -> None:
+    assert message in refused(integrator=nerf(nested), box=slab(place(), 1.0, GLOW))
+    two = {**nerf("path"), "other": {"type": "prb"}}
+    assert "2 nested integrators, expected at most one" in refused(integrator=two)
+
+
+def test_normalised_device_coordinates_stand_alone(tmp_path: Path) -> None:
+    file = small_file(tmp_path, ndc=Ndc(1.0, 1.0))
+    box = {"type": "cube", "interior": {"type": "nerfmedium", "filename": str(file)}}
+    said = refused(box=box, other=slab(place(), 1.0, GLOW))
+    assert "2 fields, one of them in normalised device coordinates" in said
+    assert "aov 'normal' of a field in normalised" in refused(integrator=nerf(aovs=AOVS), box=box)
+    image = render(scene_of(nerf(), box=box, wall=wall(2.0), sky=sky()))
+    assert np.isfinite(image).all()
+    scene = mi.load_dict(scene_of(nerf(), box=box))
+    params = mi.traverse(scene)
+    dr.enable_grad(params["box.interior_medium.to_world"])
     params.update()
-    dr.backward(loss(scene, params))
-    backward = float(dr.grad(x)[0])
-    x = mi.Float(0.0)
-    dr.enable_grad(x)
-    change(params, x)
-    params.update()
-    dr.forward(x, dr.ADFlag.ClearEdges)
-    forward = float(dr.forward_to(loss(scene, params)).array[0])
-    expected = (at(step) - at(-step)) / (2 * step)
-    change(params, mi.Float(0.0))
-    params.update()
-    print(backward, forward, expected)
-    assert abs(expected) > 1e-2
-    assert backward == pytest.approx(expected, rel=rel), keys
-    assert forward == pytest.approx(backward, rel=1e-3), keys
+    with pytest.raises(mi_nerf.InputError, match="the place of a field in normalised"):
+        dr.backward(mi.render(scene, params))
