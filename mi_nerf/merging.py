@@ -84,6 +84,8 @@ def merge(layers: list[Layer], rays: int) -> Pieces:
     sample = [dr.full(uint, _NONE, rays * width) for _ in layers]
     dr.make_opaque(t, sample)
     for i, (layer, table) in enumerate(zip(layers, tables, strict=True)):
+        if not len(table.list):
+            continue
         with dr.suspend_grad():
             end = table.list
             row = end // layer.stride
@@ -149,7 +151,8 @@ class _Ends:
         samples = layer.samples
         self.asked = dr.zeros(dr.mask_t(layer.edges), len(samples.t))
         dr.make_opaque(self.asked)
-        dr.scatter(self.asked, True, layer.evaluation.asked)
+        if len(layer.evaluation.asked):
+            dr.scatter(self.asked, dr.mask_t(layer.edges)(True), layer.evaluation.asked)
         index = dr.arange(uint, len(self._edges))
         row = index // self._stride
         number = index - row * self._stride  # of the end in its row

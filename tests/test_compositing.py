@@ -242,6 +242,20 @@ def test_a_field_of_nothing_changes_nothing(tmp_path: Path) -> None:
     assert 0.2 < image[..., 5].mean() < 0.999
 
 
+def test_fields_that_are_empty_where_they_overlap(tmp_path: Path) -> None:
+    contents = mi_nerf.load_field(small_file(tmp_path))
+    empty = mi_nerf.FieldFile(
+        contents.config, contents.weights, np.zeros((4, 4, 4), bool), contents.march
+    )
+    mi_nerf.save_field(tmp_path / "empty.safetensors", empty)
+    medium = {"type": "nerfmedium", "filename": str(tmp_path / "empty.safetensors")}
+    cubes = {name: {"type": "cube", "interior": medium} for name in "ab"}
+    assert render(scene_of(nerf(None, aovs=AOVS), **cubes)).max() == 0
+    fog = slab(place(), 0.5, GLOW)
+    image = render(scene_of(nerf(None), **cubes, fog=fog))
+    np.testing.assert_allclose(image, render(scene_of(nerf(None), fog=fog)), atol=1e-5)
+
+
 def test_instances_show_what_copies_show(tmp_path: Path) -> None:
     """One medium in two cubes, or two media of one file."""
     file = small_file(tmp_path)
@@ -391,6 +405,16 @@ def test_nested_integrators_of_all_kinds(nested: str) -> None:
     np.testing.assert_allclose(image, path, atol=0.05)
 
 
+def test_several_paths_a_ray_are_less_noisy() -> None:
+    """Of the same camera rays, whose values converge with the number of paths."""
+    light = lamp(0.0, (6.0, 5.0, 4.0))
+    light["to_world"] = place().look_at(origin=[1, -5, 3], target=[0, 0, 0], up=[0, 0, 1])
+    solids = {"wall": wall(0.2), "light": light, "field": slab(place(), 0.5, GLOW)}
+    few, more, many = (render(scene_of(nerf(paths=n), **solids)) for n in (1, 16, 256))
+    errors = [np.square(image - many).mean() for image in (few, more)]
+    assert errors[0] > 1e-5 and errors[1] < errors[0] / 8
+
+
 def test_normals_point_out_of_the_densest_place() -> None:
     """Of a Gaussian, every gradient points to its centre, wherever its cube puts that."""
     move = place().translate([0.3, 0.2, -0.1]).rotate([0, 1, 0], 30).scale(0.7)
@@ -423,7 +447,7 @@ def interlocked(nested: str, file: Path) -> Any:
     blob = formula_dict("gaussian", place().translate([0.2, 0.2, 0]), peak=2.0, width=0.3)
     return mi.load_dict(
         scene_of(
-            nerf({"type": nested, "max_depth": 3}, aovs="depth"),
+            nerf({"type": nested, "max_depth": 3}, aovs="depth", paths=2),
             net={
                 "type": "cube",
                 "to_world": move,

@@ -23,7 +23,7 @@ class Behind:
     valid: Any  # 1 where there is something opaque, to the film's alpha channel
     distance: Any = None  # to the first surface, infinite where there is none; None: nowhere
     normal: Any = None  # of that surface, in world coordinates; 0 where there is none
-    state: Any = None  # of the nested integrator, which some need for derivatives
+    states: Any = None  # of the nested integrator, which some need for derivatives
 
 
 class Environment:
@@ -57,44 +57,66 @@ class Environment:
 class Surfaces:
     """All shapes but the cubes of fields, as a nested integrator shows them."""
 
-    def __init__(self, scene: mi.Scene, integrator: mi.SamplingIntegrator, normals: bool) -> None:
+    def __init__(
+        self, scene: mi.Scene, integrator: mi.SamplingIntegrator, paths: int, normals: bool
+    ) -> None:
         """
         Args:
             scene: without the cubes, see :class:`SolidScene`.
+            paths: how often the integrator is asked about every ray.
             normals: whether normals are wanted.
         """
-        self._scene, self._integrator, self._normals = scene, integrator, normals
+        self._scene, self._integrator = scene, integrator
+        self._paths, self._normals = paths, normals
 
     def look(self, ray: Any, sampler: Any) -> Behind:
-        """What the nested integrator returns for the rays."""
+        """What the nested integrator returns for the rays, on average."""
         distance, normal = self._first(ray)
-        radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler)
-        seen = Behind(list(radiance), dr.select(valid, mi.Float(1), 0), distance, normal, state)
-        dr.eval(seen.radiance, seen.valid, seen.distance, seen.normal, seen.state)
+        total, states, valid = mi.Color3f(0), [], mi.Bool(False)
+        sampler = sampler.clone()
+        for _ in range(self._paths):
+            radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler)
+            total += radiance
+            states.append(state)
+            sampler.schedule_state()
+            dr.eval(total, valid, state)
+        radiance = list(total * (1 / self._paths))
+        seen = Behind(radiance, dr.select(valid, mi.Float(1), 0), distance, normal, states)
+        dr.eval(seen.radiance, seen.valid, seen.distance, seen.normal)
         return seen
 
     def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
         """Carries gradients of the radiance to the parameters of surfaces and lights."""
         if not self._differentiable():
             return
-        if isinstance(self._integrator, RBIntegrator):
-            pull = mi.Color3f(*gradients)
-            self._sample(dr.ADMode.Backward, ray, sampler, pull, seen.state)
+        pull = mi.Color3f(*gradients) * (1 / self._paths)
+        sampler = sampler.clone()
+        for state in seen.states:
+            if isinstance(self._integrator, RBIntegrator):
+                self._sample(dr.ADMode.Backward, ray, sampler, pull, state)
+            else:
+                with dr.resume_grad(), _differentiable_loops():
+                    radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler)
+                    _backward(list(radiance), list(pull))
+            sampler.schedule_state()
             dr.eval()
-            return
-        with dr.resume_grad(), _differentiable_loops():
-            radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler)
-            _backward(list(radiance), gradients)
 
     def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
         """The derivative of the radiance along the gradients of surfaces and lights."""
+        total = dr.zeros(mi.Color3f, dr.width(ray))
         if not self._differentiable():
-            return [dr.zeros(mi.Float, dr.width(ray))] * 3
-        if isinstance(self._integrator, RBIntegrator):
-            return list(self._sample(dr.ADMode.Forward, ray, sampler, None, seen.state)[0])
-        with dr.resume_grad(), _differentiable_loops():
-            radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler)
-            return _forward(list(radiance))
+            return list(total)
+        sampler = sampler.clone()
+        for state in seen.states:
+            if isinstance(self._integrator, RBIntegrator):
+                total += self._sample(dr.ADMode.Forward, ray, sampler, None, state)[0]
+            else:
+                with dr.resume_grad(), _differentiable_loops():
+                    radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler)
+                    total += mi.Color3f(*_forward(list(radiance)))
+            sampler.schedule_state()
+            dr.eval(total)
+        return list(total * (1 / self._paths))
 
     def _first(self, ray: Any) -> tuple[Any, Any]:
         """Distance to the first surface, infinite without one, and its normal."""
@@ -112,8 +134,8 @@ class Surfaces:
     def _sample(
         self, mode: dr.ADMode, ray: Any, sampler: Any, pull: Any = None, state: Any = None
     ) -> tuple[Any, Any, Any]:
-        """Radiance, validity and state; the same random numbers at every call."""
-        scene, sampler = self._scene, sampler.clone()
+        """Radiance, validity and state of one path a ray."""
+        scene = self._scene
         if not isinstance(self._integrator, ADIntegrator):
             radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, True)
             return radiance, valid, None

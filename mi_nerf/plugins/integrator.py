@@ -32,18 +32,28 @@ class NerfIntegrator(ADIntegrator):
 
     .. pluginparameters::
 
+     * - (nested plugin)
+       - |integrator|
+       - What shows surfaces and lights, such as :monosp:`path` or :monosp:`prb`: any integrator
+         that returns the radiance along a ray. Without one, the scene's surfaces are left out,
+         and only its environment emitter is seen. (Default: none)
+     * - paths
+       - |int|
+       - How often the nested integrator is asked about each camera ray. A ray through a field
+         costs many times as much as a path: with 4 samples a pixel and ``paths`` 16, surfaces
+         get 64 paths a pixel for the price of 4 rays through the fields. (Default: 1)
      * - samples
        - |int|
-       - Strata along each ray between entry and exit of the field's box.
+       - Strata along each ray between entry and exit of a field's box.
          (Default: what the field file suggests)
      * - near, far
        - |float|
-       - Fixed bounds of the distance along the ray, in world units, within the box.
+       - Fixed bounds of the distance along the ray, in world units, within the boxes.
          (Default: what the field file suggests)
      * - stop
        - |float|
-       - A ray ends where less than this share of the light behind passes, which changes
-         the opacity by less than it, and a colour by less than it times the largest
+       - A ray ends where a field lets pass less than this share of the light behind, which
+         changes the opacity by less than it, and a colour by less than it times the largest
          radiance. Derivatives always take all samples. 0 switches it off.
          (Default: what the field file suggests, 1e-3 as trained)
      * - jitter
@@ -52,31 +62,60 @@ class NerfIntegrator(ADIntegrator):
          it, all randomness comes from the film position. (Default: true)
      * - aovs
        - |string|
-       - Extra channels, a comma-separated list of ``depth`` (mean distance along the
-         ray, weighted by contribution; 0 where the field is not seen) and ``opacity``,
-         each perhaps with a channel name in front as in ``z:depth``. (Default: none)
+       - Extra channels, a comma-separated list of the following, each perhaps with a channel
+         name in front as in ``z:depth``. (Default: none)
+
+         - ``depth``: mean distance along the ray of fields and the first surface, weighted by
+           what each contributes; 0 where nothing is seen.
+         - ``opacity``: that of the fields before the first surface.
+         - ``normal``: mean of the unit normals −∇σ/|∇σ| of fields, in world coordinates, and
+           the shading normal of the first surface, weighted likewise; three channels. It
+           carries no derivatives.
+         - ``index``: number of the field that contributes most, counted from 1 in the
+           alphabetical order of the ids of the cubes; 0 where no field is seen. Averaged like
+           everything else over the samples of a pixel, without derivatives.
      * - hide_emitters
        - |bool|
-       - Leave out the environment emitter behind the field. (Default: false)
+       - Leave out the environment emitter behind the fields. A nested integrator has an option
+         of its own for that. (Default: false)
 
-    Estimates the volume-rendering integral (NeRF, Eq. 3) of the scene's ``nerfmedium``,
-    in front of the scene's environment emitter if it has one and of black otherwise.
-    The alpha channel of an RGBA film is the field's opacity. The colour of a field
-    trained on sRGB images is composited as in training and then decoded: with C the
-    composited colour and A the opacity of a ray, the linear radiance is
-    A·srgb_to_linear(C/A). Images are differentiable with respect to the field's weights.
+    Estimates the volume-rendering integral (NeRF, Eq. 3) of all ``nerfmedium`` of the scene.
+    Where several overlap, densities add up and the emission is the mean by density,
+    c = Σ σ_k c_k / Σ σ_k: the samples of all fields along a ray are merged in depth and
+    integrated once (:py:mod:`mi_nerf.merging`). The integral ends exactly at the first
+    surface, and the nested integrator's radiance of the ray, weakened by the fields before it,
+    is added. The nested integrator does not know the fields: it sees the scene without their
+    cubes, so fields cast no shadows and are missing in mirrors. What is seen through a surface
+    that is not opaque is likewise without fields.
+
+    The alpha channel of an RGBA film is the opacity of the fields; with a nested integrator,
+    its alpha channel with the fields in front. The colour of a field trained on sRGB images is
+    composited as in training and then decoded: with C the colour under the field's weights and
+    A their sum, the linear radiance is A·srgb_to_linear(C/A). Other fields and surfaces are
+    mixed with that in linear radiance: each field on its own looks just as it does alone, and
+    where it is partly transparent, as at its edges, it is blended with what lies behind it as
+    light is, not as the numbers of an sRGB image are. Compositing the same field in sRGB over a
+    bright background, as training on white does, gives darker edges.
+
+    Images are differentiable with respect to the weights of the fields and their places (the
+    medium's ``to_world``, the vertices of its cube), and to whatever the nested integrator
+    differentiates, such as colours of surfaces and lights; not with respect to where surfaces
+    or the camera are. Mitsuba's C++ integrators are differentiated by recording their paths,
+    which takes memory for every bounce; :monosp:`prb` spares that.
 
     .. tabs::
         .. code-tab:: xml
 
             <integrator type="nerf">
                 <string name="aovs" value="depth,opacity"/>
+                <integrator type="path"/>
             </integrator>
 
         .. code-tab:: python
 
             'type': 'nerf',
-            'aovs': 'depth,opacity'
+            'aovs': 'depth,opacity',
+            'nested': {'type': 'path'}
     """
 
     def __init__(self, props: mi.Properties) -> None:
@@ -98,6 +137,9 @@ class NerfIntegrator(ADIntegrator):
         self.show_background = not bool(props.get("hide_emitters", False))
         self.aovs = _parse_aovs(str(props.get("aovs", "")))
         self.nested = self._find_nested(props)
+        self.paths = int(props.get("paths", 1))
+        if self.paths < 1:
+            raise InputError(f"nerf: paths={self.paths}, expected 1 or more")
         self._solid, self._warned = SolidScene(), False
 
     @staticmethod
@@ -136,7 +178,7 @@ class NerfIntegrator(ADIntegrator):
             f"  stop = {'from field file' if self.stop is None else self.stop},\n"
             f"  jitter = {self.jitter},\n"
             f"  aovs = {self.aov_names()},\n"
-            f"  nested = {self.nested}\n"
+            f"  nested = {self.nested}, paths = {self.paths}\n"
             "]"
         )
 
@@ -246,7 +288,7 @@ class NerfIntegrator(ADIntegrator):
             self._warn_of_surfaces(scene)
             backdrop = Environment(scene, self.show_background)
         else:
-            backdrop = Surfaces(self._solid.of(scene), self.nested, normals)
+            backdrop = Surfaces(self._solid.of(scene), self.nested, self.paths, normals)
         return Stage(fields, backdrop, normals)
 
     def _march(self, placed: PlacedField) -> MarchSettings:
