@@ -143,7 +143,7 @@ def inverse_transform(
     u = dr.fmin(u, _BELOW_ONE)
     ray = dr.arange(uint, len(u)) // samples
     first = ray * bins
-    k = _count_below(start, u, first, bins, strict=False) - 1  # start is 0 in the first bin
+    k = count_below(start, u, first, bins, strict=False) - 1  # start is 0 in the first bin
     inside = (u - dr.gather(float_type, start, first + k)) / dr.gather(float_type, share, first + k)
     place = (float_type(k) + dr.clip(inside, 0, 1)) * (1 / bins)
     near, far = dr.gather(float_type, t_near, ray), dr.gather(float_type, t_far, ray)
@@ -168,13 +168,13 @@ def merge_sorted(a: Any, b: Any, count_a: int, count_b: int) -> Any:
     ):
         index = dr.arange(uint, len(own))
         ray = index // own_count
-        rank = _count_below(other, own, ray * other_count, other_count, strict)
+        rank = count_below(other, own, ray * other_count, other_count, strict)
         dr.scatter(merged, own, ray * count + (index - ray * own_count) + rank)
     dr.eval(merged)
     return merged
 
 
-def _count_below(row: Any, value: Any, first: Any, count: int, strict: bool) -> Any:
+def count_below(row: Any, value: Any, first: Any, count: int, strict: bool) -> Any:
     """How many of ``row[first … first + count]`` lie below (or at) ``value``."""
     float_type = type(row)
 
@@ -183,6 +183,40 @@ def _count_below(row: Any, value: Any, first: Any, count: int, strict: bool) -> 
         return entry < value if strict else entry <= value
 
     return dr.binary_search(0, count, below)
+
+
+def stratum_edges(t_near: Any, t_far: Any, samples: int) -> Any:
+    """The ends of equal strata: R·(S + 1) ascending parameters, of S strata a ray."""
+    float_type = type(t_near)
+    uint = dr.uint32_array_t(float_type)
+    index = dr.arange(uint, len(t_near) * (samples + 1))
+    ray = index // (samples + 1)
+    near, far = dr.gather(float_type, t_near, ray), dr.gather(float_type, t_far, ray)
+    share = float_type(index - ray * (samples + 1)) * (1 / samples)
+    return dr.select(share < 1, dr.fmin(dr.fma(share, far - near, near), far), far)
+
+
+def cell_edges(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
+    """The ends of what belongs to each sample, see :func:`cell_widths`.
+
+    Args:
+        t: R·S ascending parameters.
+        t_near, t_far: bounds of R rays.
+        samples: S.
+
+    Returns:
+        R·(S + 1) ascending parameters, from ``t_near`` to ``t_far``.
+    """
+    float_type = type(t)
+    uint = dr.uint32_array_t(float_type)
+    index = dr.arange(uint, len(t_near) * (samples + 1))
+    ray = index // (samples + 1)
+    within = index - ray * (samples + 1)
+    after = ray * samples + dr.fmin(within, samples - 1)
+    before = ray * samples + dr.fmax(within, 1) - 1
+    middle = 0.5 * (dr.gather(float_type, t, before) + dr.gather(float_type, t, after))
+    near, far = dr.gather(float_type, t_near, ray), dr.gather(float_type, t_far, ray)
+    return dr.select(within == 0, near, dr.select(within == samples, far, middle))
 
 
 def cell_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:

@@ -27,12 +27,14 @@ from .occupancy import OccupancyGrid
 from .quadrature import Composite, Rule, composite, sample_weights
 from .sampling import (
     box_interval,
+    cell_edges,
     cell_widths,
     clip_interval,
     inverse_transform,
     merge_sorted,
     points_along,
     stratified,
+    stratum_edges,
 )
 from .stages import stage
 
@@ -123,6 +125,7 @@ class Samples:
     coarse_queries: int = 0  # of the coarse network, by which the samples were placed
     ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
     rule: Rule = "constant"
+    even: bool = True  # whether the intervals are equal strata of the ray
 
     @property
     def rays(self) -> int:
@@ -133,6 +136,12 @@ class Samples:
     def queries(self) -> int:
         """M."""
         return len(self.index)
+
+    def edges(self) -> Any:
+        """R·(S + 1) ascending ends of the intervals: sample s lies between s and s + 1."""
+        if self.even:
+            return stratum_edges(self.near, self.far, self.count)
+        return cell_edges(self.t, self.near, self.far, self.count)
 
     def truncate(self, budget: int) -> Any:
         """Keeps the first ``budget`` queries; returns how many rays keep all of theirs.
@@ -169,10 +178,13 @@ def place_samples(
         within = ray_segments(field, o, d, (settings.near, settings.far), bounds or (None, None))
         o, d, near, far = within.o, within.d, within.near, within.far
         t, delta = stratified(near, far, settings.samples, jitter)
-        if settings.rule != "constant":
+        even = settings.rule == "constant"
+        if not even:
             delta = cell_widths(t, near, far, settings.samples)
         count, rule, ndc = settings.samples, settings.rule, within.ndc
-        samples = Samples(o, d, within.view, t, delta, count, near, far, ndc=ndc, rule=rule)
+        samples = Samples(
+            o, d, within.view, t, delta, count, near, far, ndc=ndc, rule=rule, even=even
+        )
         samples = _select(samples, within.hit, occupancy, settings.hidden)
         coarse = getattr(field, "coarse", None)
         if coarse is None or not settings.fine:
@@ -207,7 +219,12 @@ def refine(
         t = merge_sorted(samples.t, more, count, fine)
         delta = cell_widths(t, near, far, count + fine)
         merged = replace(
-            samples, t=t, delta=delta, count=count + fine, coarse_queries=samples.queries
+            samples,
+            t=t,
+            delta=delta,
+            count=count + fine,
+            coarse_queries=samples.queries,
+            even=False,
         )
         return _select(merged, far > near, occupancy, hidden)
 
@@ -334,7 +351,10 @@ class Evaluation:
             dr.enable_grad(channel)
 
     def backward(self) -> None:
-        """Propagates the gradients of density and emission to the parameters."""
+        """Propagates the gradients of density and emission to the parameters.
+
+        And to o, d, t and view of the samples, as far as gradients of these are enabled.
+        """
         gradients = [dr.grad(channel) for channel in self._channels]
         with stage("compositing"):  # its adjoint
             dr.eval(gradients)
@@ -349,16 +369,22 @@ class Evaluation:
                         dr.enqueue(dr.ADMode.Backward, value)
                 dr.traverse(dr.ADMode.Backward)
                 with stage("encoding_adjoint"):
-                    dr.eval([dr.grad(p) for p in self._field.parameters().values()])
+                    dr.eval([dr.grad(leaf) for leaf in self._leaves()])
         self._graph = []
 
+    def _leaves(self) -> list[Any]:
+        """All that gradients are added up for."""
+        samples = self._samples
+        moving = [v for v in (samples.o, samples.d, samples.view, samples.t) if dr.grad_enabled(v)]
+        return [*self._field.parameters().values(), *moving]
+
     def forward(self) -> None:
-        """Fills the gradients of density and emission from those of the parameters."""
+        """Fills the gradients of density and emission from those that :meth:`backward` adds to."""
         tangents = [dr.zeros(type(c), len(c)) for c in self._channels]
         for where, valid in self._blocks(self.asked, self._block):
             outputs = self._query(where)
             # One output may be computed from another: keep the tangents of all.
-            dr.forward_to(outputs, flags=dr.ADFlag.ClearNone)
+            dr.forward_to(outputs, flags=dr.ADFlag.ClearNone | dr.ADFlag.AllowNoGrad)
             for tangent, value in zip(tangents, outputs, strict=True):
                 dr.scatter(tangent, dr.grad(value), where, valid)
             dr.eval(tangents)
@@ -434,6 +460,36 @@ def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
         return seen
     distance = samples.ndc.to_distance(seen.depth)
     return replace(seen, depth=dr.select(seen.opacity > 0, distance, 0))
+
+
+def density_gradient(field: Field, samples: Samples, index: Any, block: int) -> list[Any]:
+    """∇σ at the samples ``index``, zero at the others: three arrays of R·S values.
+
+    In the space where the field lives, 1/unit². It carries no gradient itself, and leaves
+    those of the field's parameters alone.
+
+    Args:
+        block: queries the network evaluates at a time.
+    """
+    float_type, uint = type(samples.t), type(index)
+    result = [dr.zeros(float_type, len(samples.t)) for _ in range(3)]
+    dr.make_opaque(result)
+    for start in range(0, len(index), block):
+        slot = dr.arange(uint, block) + dr.opaque(uint, start)
+        valid = slot < dr.opaque(uint, len(index))
+        where = dr.gather(uint, index, slot, valid)
+        t = dr.gather(float_type, dr.detach(samples.t), where)
+        o, d = dr.detach(samples.o), dr.detach(samples.d)
+        p = points_along(o, d, t, where // samples.count)
+        dr.eval(p, where, valid)
+        with dr.resume_grad(), dr.suspend_grad(*field.parameters().values()):
+            dr.enable_grad(p)
+            dr.backward(field.density(p), dr.ADFlag.Default | dr.ADFlag.AllowNoGrad)
+            gradient = dr.grad(p)
+        for channel, value in zip(result, gradient, strict=True):
+            dr.scatter(channel, value, where, valid)
+        dr.eval(result)
+    return result
 
 
 @dataclass

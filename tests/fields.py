@@ -55,20 +55,7 @@ def scene_dict(
     return {
         "type": "scene",
         "integrator": {"type": "nerf", **(integrator or {})},
-        "sensor": {
-            "type": "perspective",
-            "fov": 40.0,
-            "to_world": view,
-            "film": {
-                "type": "hdrfilm",
-                "width": size[0],
-                "height": size[1],
-                "pixel_format": "rgba",
-                "rfilter": {"type": "box"},
-                **(film or {}),
-            },
-            "sampler": {"type": "independent", "sample_count": spp},
-        },
+        "sensor": camera_dict(view, size=size, film=film, spp=spp),
         "box": {
             "type": "cube",
             "to_world": transform,
@@ -79,6 +66,39 @@ def scene_dict(
     }
 
 
+def camera_dict(
+    view: Any, *, size: tuple[int, int], film: dict[str, Any] | None = None, spp: int = 1
+) -> dict[str, Any]:
+    """A perspective camera of 40 degrees with an RGBA film."""
+    return {
+        "type": "perspective",
+        "fov": 40.0,
+        "to_world": view,
+        "film": {
+            "type": "hdrfilm",
+            "width": size[0],
+            "height": size[1],
+            "pixel_format": "rgba",
+            "rfilter": {"type": "box"},
+            **(film or {}),
+        },
+        "sampler": {"type": "independent", "sample_count": spp},
+    }
+
+
+def formula_dict(kind: str, to_world: Any = None, **numbers: Any) -> dict[str, Any]:
+    """A cube that holds a field given by a formula."""
+    import mitsuba as mi
+
+    return {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f() if to_world is None else to_world,
+        "bsdf": {"type": "null"},
+        "interior": {"type": "nerfmedium", "field": kind, **numbers},
+    }
+
+
 def weight_keys(params: Any) -> list[str]:
     """The names of a field's tensors among a scene's parameters."""
-    return [k for k in params.keys() if "interior_medium" in k]  # noqa: SIM118
+    keys = [k for k in params.keys() if "interior_medium" in k]  # noqa: SIM118
+    return [k for k in keys if not k.endswith(".to_world")]

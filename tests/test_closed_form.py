@@ -20,6 +20,7 @@ from mi_nerf.field import Field
 from mi_nerf.volume import Evaluation, MarchSettings, integrate, place_samples, render_rays
 from tests import closed_forms as oracle
 from tests.arrays import unit, vectors
+from tests.fields import weight_keys
 
 VARIANT = choose_variant()
 BACKEND = array_module(VARIANT)
@@ -415,7 +416,7 @@ def test_pixels(kind: str) -> None:
     exact = oracle.seen(kind, v, rays)
     assert exact[:, 3].max() > 0.3 and np.ptp(exact[:, 3]) > 0.05
     assert image == pytest.approx(exact, rel=1e-3, abs=5e-4)
-    names = {k.rsplit(".", 1)[1] for k in mi.traverse(scene).keys() if "interior" in k}  # noqa: SIM118
+    names = {k.rsplit(".", 1)[1] for k in weight_keys(mi.traverse(scene))}
     assert names == set(v)
 
 

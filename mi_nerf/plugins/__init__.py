@@ -11,7 +11,8 @@ import sys
 
 import mitsuba as mi
 
-_MODULES = ("medium", "camera", "integrator", "tracking")  # bases first
+# Each before those that import it.
+_MODULES = ("medium", "backdrop", "camera", "integrator", "tracking")
 _loaded_for: str | None = None
 _follows_variant = False
 

@@ -1,4 +1,4 @@
-"""What integrators that show a radiance field have in common: camera rays, film, background."""
+"""What integrators that show radiance fields have in common: camera rays and film."""
 
 from __future__ import annotations
 
@@ -11,32 +11,34 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import ADIntegrator
 
-from ..color import linear_to_srgb, srgb_to_linear
 from ..errors import InputError
-from ..field import Field
-from ..quadrature import over_background
-from .placement import PlacedField, find_field
 
 # Camera rays traced at a time; more samples per pixel take several passes.
 _RAYS_PER_PASS = 1 << 22
+_AXES = (".X", ".Y", ".Z")
 
 
 @dataclass
 class Wave:
-    """The camera rays of one pass, and what they returned."""
+    """The camera rays of one pass; subclasses add what these return."""
 
     ray: Any
     weight: Any
     position: Any  # on the film
     random: Any  # what the integrator needs of randomness, a number or so a ray
-    outputs: list[Any]  # R, G, B, opacity, and what else the integrator knows
+    sampler: mi.Sampler  # in the state in which a nested integrator finds it
+
+    def shown(self) -> dict[str, Any]:
+        """``color``, ``alpha``, and all channels that the integrator knows."""
+        raise NotImplementedError
 
 
 class FieldIntegrator(ADIntegrator):
-    """Sends camera rays through the one field of a scene; how is up to subclasses."""
+    """Sends camera rays through the fields of a scene; how is up to subclasses."""
 
     plugin: str  # its name
-    known: tuple[str, ...]  # extra channels that it offers, in the order of its outputs
+    known: tuple[str, ...]  # extra channels that it offers
+    wave: type[Wave]
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -53,7 +55,11 @@ class FieldIntegrator(ADIntegrator):
 
     def aov_names(self) -> list[str]:
         """Names of the extra channels."""
-        return [name for name, _ in self.aovs]
+        return [
+            name + part
+            for name, kind in self.aovs
+            for part in (_AXES if kind == "normal" else ("",))
+        ]
 
     # ---------------------------------- What subclasses do ----------------------------------
 
@@ -62,10 +68,8 @@ class FieldIntegrator(ADIntegrator):
         """Takes from the sampler what a wave needs of randomness."""
 
     @abstractmethod
-    def _traced(
-        self, scene: mi.Scene, placed: PlacedField, waves: Iterable[Wave]
-    ) -> Iterator[Wave]:
-        """Fills in the outputs of waves, without derivatives."""
+    def _traced(self, scene: mi.Scene, waves: Iterable[Any]) -> Iterator[Any]:
+        """Fills in what the rays of such waves see, without derivatives."""
 
     # ---------------------------------- Rendering ----------------------------------
 
@@ -81,9 +85,8 @@ class FieldIntegrator(ADIntegrator):
         """Renders an image; see ``mi.render``."""
         sensor = self._sensor(scene, sensor)
         with dr.suspend_grad():
-            placed = find_field(scene)
-            waves = self._waves(scene, sensor, seed, spp)
-            image = self._develop(sensor.film(), self._traced(scene, placed, waves), develop)
+            waves = self._traced(scene, self._waves(scene, sensor, seed, spp))
+            image = self._develop(sensor.film(), waves, develop)
             if evaluate and develop:
                 dr.eval(image)
         return image
@@ -93,12 +96,11 @@ class FieldIntegrator(ADIntegrator):
     ) -> tuple[Any, Any, list[Any], Any]:
         """Radiance along single rays, for integrators that nest this one."""
         with dr.suspend_grad():
-            placed = find_field(scene)
-            wave = Wave(ray, None, None, self._draw(sampler, dr.width(ray), 0), [])
-            for _ in self._traced(scene, placed, [wave]):
+            wave = self.wave(ray, None, None, self._draw(sampler, dr.width(ray), 0), sampler)
+            for _ in self._traced(scene, [wave]):
                 pass
-        valid = wave.outputs[3] > 0
-        return mi.Color3f(*wave.outputs[:3]), valid, self._aov_values(wave), None
+            shown = wave.shown()
+        return shown["color"], shown["alpha"] > 0, self._aov_values(shown), None
 
     # ---------------------------------- Camera rays ----------------------------------
 
@@ -113,7 +115,7 @@ class FieldIntegrator(ADIntegrator):
             )
         return sensors[sensor]
 
-    def _waves(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Iterator[Wave]:
+    def _waves(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Iterator[Any]:
         """Camera rays, in passes of bounded size with seeds of their own."""
         film = sensor.film()
         spp = spp or sensor.sampler().sample_count()
@@ -127,80 +129,45 @@ class FieldIntegrator(ADIntegrator):
             ray, weight, position = self.sample_rays(scene, sensor, sampler)
             random = self._draw(sampler, dr.width(ray), pass_seed)
             dr.eval(ray, weight, position, random)
-            yield Wave(ray, weight, position, random, [])
+            sampler.schedule_state()
+            dr.eval()
+            yield self.wave(ray, weight, position, random, sampler)
 
     def _develop(self, film: mi.Film, waves: Iterable[Wave], develop: bool) -> Any:
         """Splats the rays' values through the film's reconstruction filter."""
         block = None
         for wave in waves:
             block = block or film.create_block()
-            r, g, b, opacity = wave.outputs[:4]
+            shown = wave.shown()
             ADIntegrator._splat_to_block(
                 block,
                 film,
                 wave.position,
-                value=mi.Color3f(r, g, b) * wave.weight,
+                value=shown["color"] * wave.weight,
                 weight=1.0,
-                alpha=opacity,
-                aovs=self._aov_values(wave),
+                alpha=shown["alpha"],
+                aovs=self._aov_values(shown),
                 wavelengths=wave.ray.wavelengths,
             )
             dr.eval(block.tensor())  # lets go of this pass before the next one
         film.put_block(block)
         return film.develop() if develop else None
 
-    def _aov_values(self, wave: Wave) -> list[Any]:
-        values = dict(zip(self.known, wave.outputs[3:], strict=True))
-        return [values[kind] for _, kind in self.aovs]
+    def _aov_values(self, shown: dict[str, Any]) -> list[Any]:
+        return [
+            value
+            for _, kind in self.aovs
+            for value in (shown[kind] if kind == "normal" else [shown[kind]])
+        ]
 
     def _parse_aovs(self, text: str) -> list[tuple[str, str]]:
         """Channel names and kinds of a list such as ``depth, a:opacity``."""
         aovs = []
+        expected = " or ".join(filter(None, (", ".join(self.known[:-1]), self.known[-1])))
         for item in text.replace(" ", "").split(","):
             name, _, kind = item.rpartition(":")
             if item and kind not in self.known:
-                raise InputError(
-                    f"{self.plugin}: aov '{item}' is unknown, "
-                    f"expected {' or '.join(sorted(self.known))}"
-                )
+                raise InputError(f"{self.plugin}: aov '{item}' is unknown, expected {expected}")
             if item:
                 aovs.append((name or kind, kind))
         return aovs
-
-    # ---------------------------------- Bounds and background ----------------------------------
-
-    def _bounds(self, placed: PlacedField, ray: Any, scale: Any) -> tuple[Any, Any]:
-        """Per-ray bounds of t in field units: the integrator's, the file's, the sensor's."""
-        march = placed.medium.march
-        near = mi.Float(march.near or 0) if self.near is None else self.near * scale
-        far = mi.Float(dr.inf if march.far is None else march.far)
-        if self.far is not None:
-            far = self.far * scale
-        return near, dr.fmin(far, ray.maxt * scale)
-
-    def _background(self, scene: mi.Scene, ray: Any) -> list[Any]:
-        """Radiance of the environment emitter along rays, zero without one."""
-        emitter = scene.environment() if self.show_background else None
-        if emitter is None:
-            return [mi.Float(0)] * 3
-        si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
-        si.wi = -ray.d
-        radiance = emitter.eval(si)
-        return [radiance.x, radiance.y, radiance.z]
-
-    def _in_front(
-        self, field: Field, color: list[Any], opacity: Any, background: list[Any]
-    ) -> list[Any]:
-        """What a field shows in front of a background, in linear space or as composited."""
-        if field.color_space == "srgb" and self.encoded:
-            background = [linear_to_srgb(b) for b in background]
-        elif field.color_space == "srgb":
-            color = _linear(color, opacity)
-        return over_background(color, opacity, background)
-
-
-def _linear(color: list[Any], opacity: Any) -> list[Any]:
-    """Premultiplied linear radiance of premultiplied sRGB colour."""
-    visible = opacity > 0
-    inverse = dr.select(visible, 1 / dr.select(visible, opacity, 1), 0)
-    return [srgb_to_linear(c * inverse) * opacity for c in color]

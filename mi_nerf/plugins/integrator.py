@@ -1,4 +1,4 @@
-"""The ``nerf`` integrator: shows a radiance field by quadrature along camera rays."""
+"""The ``nerf`` integrator: radiance fields among surfaces, by quadrature along camera rays."""
 
 from __future__ import annotations
 
@@ -11,16 +11,12 @@ import mitsuba as mi
 
 from ..errors import InputError
 from ..quadrature import Rule
-from ..volume import (
-    Evaluation,
-    MarchSettings,
-    integrate,
-    place_samples,
-    ray_chunks,
-    slice_rays,
-)
-from .camera import FieldIntegrator, Wave
-from .placement import PlacedField, find_field
+from ..volume import MarchSettings
+from .backdrop import Environment, SolidScene, Surfaces, check_nested, has_surfaces
+from .camera import FieldIntegrator
+from .crossing import Marched
+from .placement import PlacedField, find_fields
+from .stage import Stage, StageWave
 
 
 class NerfIntegrator(FieldIntegrator):
@@ -32,23 +28,34 @@ class NerfIntegrator(FieldIntegrator):
 
     .. pluginparameters::
 
+     * - (nested plugin)
+       - |integrator|
+       - What shows surfaces and lights, such as :monosp:`path` or :monosp:`prb`: any integrator
+         that returns the radiance along a ray. Without one, the scene's surfaces are left out,
+         and only its environment emitter is seen. (Default: none)
+     * - paths
+       - |int|
+       - How often the nested integrator is asked about each camera ray. A ray through a field
+         costs many times as much as a path: with 4 samples a pixel and ``paths`` 16, surfaces
+         get 64 paths a pixel for the price of 4 rays through the fields. (Default: 1)
      * - samples
        - |int|
-       - Strata along each ray between entry and exit of the field's box.
+       - Strata along each ray between entry and exit of a field's box.
          (Default: what the field file suggests)
      * - near, far
        - |float|
-       - Fixed bounds of the distance along the ray, in world units, within the box.
+       - Fixed bounds of the distance along the ray, in world units, within the boxes.
          (Default: what the field file suggests)
      * - rule
        - |string|
        - How density runs between samples: ``constant`` over strata, over ``cells`` that
-         reach halfway to the next sample, or ``linear`` from sample to sample.
+         reach halfway to the next sample, or ``linear`` from sample to sample, which counts
+         as ``cells`` where a scene holds several fields.
          (Default: what the field file suggests)
      * - stop
        - |float|
-       - A ray ends where less than this share of the light behind passes, which changes
-         the opacity by less than it, and a colour by less than it times the largest
+       - A ray ends where a field lets pass less than this share of the light behind, which
+         changes the opacity by less than it, and a colour by less than it times the largest
          radiance. Derivatives always take all samples. 0 switches it off.
          (Default: what the field file suggests, 1e-3 as trained)
      * - jitter
@@ -57,39 +64,70 @@ class NerfIntegrator(FieldIntegrator):
          it, all randomness comes from the film position. (Default: true)
      * - aovs
        - |string|
-       - Extra channels, a comma-separated list of ``depth`` (mean distance along the
-         ray, weighted by contribution; 0 where the field is not seen) and ``opacity``,
-         each perhaps with a channel name in front as in ``z:depth``. (Default: none)
+       - Extra channels, a comma-separated list of the following, each perhaps with a channel
+         name in front as in ``z:depth``. (Default: none)
+
+         - ``depth``: mean distance along the ray of fields and the first surface, weighted by
+           what each contributes; 0 where nothing is seen.
+         - ``opacity``: that of the fields before the first surface.
+         - ``normal``: mean of the unit normals −∇σ/|∇σ| of fields, in world coordinates, and
+           the shading normal of the first surface, weighted likewise; three channels. It
+           carries no derivatives.
+         - ``index``: number of the field that contributes most, counted from 1 in the
+           alphabetical order of the ids of the cubes; 0 where no field is seen. Averaged like
+           everything else over the samples of a pixel, without derivatives.
      * - hide_emitters
        - |bool|
-       - Leave out the environment emitter behind the field. (Default: false)
+       - Leave out the environment emitter behind the fields. A nested integrator has an option
+         of its own for that. (Default: false)
      * - encoded
        - |bool|
        - Leave the colour of a field trained on sRGB images as it was composited, in sRGB,
-         with the environment encoded likewise. (Default: false)
+         with the environment encoded likewise; for a single field without a nested
+         integrator. (Default: false)
 
-    Estimates the volume-rendering integral (NeRF, Eq. 3) of the scene's ``nerfmedium``,
-    in front of the scene's environment emitter if it has one and of black otherwise.
-    The alpha channel of an RGBA film is the field's opacity. The colour of a field
-    trained on sRGB images is composited as in training and then decoded: with C the
-    composited colour and A the opacity of a ray, the linear radiance is
-    A·srgb_to_linear(C/A). Images are differentiable with respect to the field's weights.
+    Estimates the volume-rendering integral (NeRF, Eq. 3) of all ``nerfmedium`` of the scene.
+    Where several overlap, densities add up and the emission is the mean by density,
+    c = Σ σ_k c_k / Σ σ_k: the samples of all fields along a ray are merged in depth and
+    integrated once (:py:mod:`mi_nerf.merging`). The integral ends exactly at the first
+    surface, and the nested integrator's radiance of the ray, weakened by the fields before it,
+    is added. The nested integrator does not know the fields: it sees the scene without their
+    cubes, so fields cast no shadows and are missing in mirrors. What is seen through a surface
+    that is not opaque is likewise without fields.
+
+    The alpha channel of an RGBA film is the opacity of the fields; with a nested integrator,
+    its alpha channel with the fields in front. The colour of a field trained on sRGB images is
+    composited as in training and then decoded: with C the colour under the field's weights and
+    A their sum, the linear radiance is A·srgb_to_linear(C/A). Other fields and surfaces are
+    mixed with that in linear radiance: each field on its own looks just as it does alone, and
+    where it is partly transparent, as at its edges, it is blended with what lies behind it as
+    light is, not as the numbers of an sRGB image are. Compositing the same field in sRGB over a
+    bright background, as training on white does, gives darker edges.
+
+    Images are differentiable with respect to the weights of the fields and their places (the
+    medium's ``to_world``, the vertices of its cube), and to whatever the nested integrator
+    differentiates, such as colours of surfaces and lights; not with respect to where surfaces
+    or the camera are. Mitsuba's C++ integrators are differentiated by recording their paths,
+    which takes memory for every bounce; :monosp:`prb` spares that.
 
     .. tabs::
         .. code-tab:: xml
 
             <integrator type="nerf">
                 <string name="aovs" value="depth,opacity"/>
+                <integrator type="path"/>
             </integrator>
 
         .. code-tab:: python
 
             'type': 'nerf',
-            'aovs': 'depth,opacity'
+            'aovs': 'depth,opacity',
+            'nested': {'type': 'path'}
     """
 
     plugin = "nerf"
-    known = ("opacity", "depth")
+    known = ("depth", "opacity", "normal", "index")
+    wave = StageWave
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -103,6 +141,30 @@ class NerfIntegrator(FieldIntegrator):
         if self.stop is not None and not 0 <= self.stop < 1:
             raise InputError(f"nerf: stop={self.stop}, expected 0 to less than 1")
         self.jitter = bool(props.get("jitter", True))
+        self.paths = int(props.get("paths", 1))
+        if self.paths < 1:
+            raise InputError(f"nerf: paths={self.paths}, expected 1 or more")
+        self.nested = self._find_nested(props)
+        self._solid, self._warned = SolidScene(), False
+
+    @staticmethod
+    def _find_nested(props: mi.Properties) -> Any:
+        """The integrator among the properties, or ``None``."""
+        found = [(key, props[key]) for key in props.unqueried()]
+        found = [(key, value) for key, value in found if isinstance(value, mi.Integrator)]
+        if len(found) > 1:
+            raise InputError(f"nerf: {len(found)} nested integrators, expected at most one")
+        for _, nested in found:
+            if isinstance(nested, NerfIntegrator):
+                raise InputError("nerf: nested in 'nerf', expected one like 'path' or 'prb'")
+            check_nested(nested)
+            return nested
+        return None
+
+    def traverse(self, callback: Any) -> None:
+        """Exposes the nested integrator."""
+        if self.nested is not None:
+            callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
 
     def to_string(self) -> str:
         """Lists the settings."""
@@ -113,7 +175,8 @@ class NerfIntegrator(FieldIntegrator):
             f"  rule = {self.rule or 'from field file'},\n"
             f"  stop = {'from field file' if self.stop is None else self.stop},\n"
             f"  jitter = {self.jitter}, encoded = {self.encoded},\n"
-            f"  aovs = {self.aov_names()}\n"
+            f"  aovs = {self.aov_names()},\n"
+            f"  nested = {self.nested}, paths = {self.paths}\n"
             "]"
         )
 
@@ -128,7 +191,7 @@ class NerfIntegrator(FieldIntegrator):
         seed: Any = 0,
         spp: int = 0,
     ) -> None:
-        """Carries the gradient of an image to the weights of the field.
+        """Carries the gradient of an image to the parameters of fields, surfaces and lights.
 
         First to the values of the camera rays, through reconstruction filter and film,
         then chunk by chunk through quadrature and network: memory does not grow with
@@ -136,12 +199,11 @@ class NerfIntegrator(FieldIntegrator):
         """
         sensor = self._sensor(scene, sensor)
         with dr.suspend_grad():
-            placed = find_field(scene)
-            waves = list(self._traced(scene, placed, self._waves(scene, sensor, seed, spp)))
+            stage = self._stage(scene)
+            waves = list(_traced(stage, self._waves(scene, sensor, seed, spp)))
             with dr.resume_grad():
                 for wave in waves:
-                    for output in wave.outputs:
-                        dr.enable_grad(output)
+                    dr.enable_grad(wave.outputs)
                 image = self._develop(sensor.film(), waves, True)
                 dr.set_grad(image, grad_in)
                 dr.enqueue(dr.ADMode.Backward, image)
@@ -149,8 +211,8 @@ class NerfIntegrator(FieldIntegrator):
                 adjoints = [[dr.grad(output) for output in wave.outputs] for wave in waves]
             dr.eval(adjoints)
             for wave, gradients in zip(waves, adjoints, strict=True):
-                for chunk in self._chunks(placed, wave):
-                    self._chunk_backward(scene, placed, wave, chunk, gradients)
+                dr.disable_grad(wave.outputs)
+                stage.backward(wave, gradients)
 
     def render_forward(
         self,
@@ -160,15 +222,13 @@ class NerfIntegrator(FieldIntegrator):
         seed: Any = 0,
         spp: int = 0,
     ) -> Any:
-        """The derivative of an image along the gradients of the field's weights."""
+        """The derivative of an image along the gradients of the scene's parameters."""
         sensor = self._sensor(scene, sensor)
         with dr.suspend_grad():
-            placed = find_field(scene)
-            waves = list(self._traced(scene, placed, self._waves(scene, sensor, seed, spp)))
+            stage = self._stage(scene)
+            waves = list(_traced(stage, self._waves(scene, sensor, seed, spp)))
             for wave in waves:
-                tangents = [dr.zeros(mi.Float, len(o)) for o in wave.outputs]
-                for chunk in self._chunks(placed, wave):
-                    self._chunk_forward(scene, placed, wave, chunk, tangents)
+                tangents = stage.forward(wave)
                 with dr.resume_grad():
                     for output, tangent in zip(wave.outputs, tangents, strict=True):
                         dr.enable_grad(output)
@@ -178,18 +238,39 @@ class NerfIntegrator(FieldIntegrator):
                 dr.forward_to(image)
                 return dr.grad(image)
 
-    # ---------------------------------- Field ----------------------------------
+    # ---------------------------------- Scene ----------------------------------
 
     def _draw(self, sampler: mi.Sampler, rays: int, seed: Any) -> Any:
         """One offset a ray, or ``None``."""
         return sampler.next_1d() if self.jitter else None
 
-    def _traced(
-        self, scene: mi.Scene, placed: PlacedField, waves: Iterable[Wave]
-    ) -> Iterator[Wave]:
-        for wave in waves:
-            self._trace(scene, placed, wave)
-            yield wave
+    def _traced(self, scene: mi.Scene, waves: Iterable[StageWave]) -> Iterator[StageWave]:
+        return _traced(self._stage(scene), waves)
+
+    def _stage(self, scene: mi.Scene) -> Stage:
+        """The scene as it is now."""
+        found = find_fields(scene)
+        encoded = self.encoded and found[0].medium.field.color_space == "srgb"
+        if self.encoded and (len(found) > 1 or self.nested is not None):
+            raise InputError(
+                "nerf: encoded=true with several fields or a nested integrator, expected a "
+                "single field: light mixes in linear radiance"
+            )
+        fields = [
+            Marched(placed, self._march(placed), self.near, self.far, encoded) for placed in found
+        ]
+        normals = any(kind == "normal" for _, kind in self.aovs)
+        if normals and any(marched.field.ndc is not None for marched in fields):
+            raise InputError(
+                "nerf: aov 'normal' of a field in normalised device coordinates, expected none"
+            )
+        backdrop: Environment | Surfaces
+        if self.nested is None:
+            self._warn_of_surfaces(scene)
+            backdrop = Environment(scene, self.show_background, encoded)
+        else:
+            backdrop = Surfaces(self._solid.of(scene), self.nested, self.paths, normals)
+        return Stage(fields, backdrop, normals)
 
     def _march(self, placed: PlacedField) -> MarchSettings:
         march = placed.medium.march
@@ -198,80 +279,21 @@ class NerfIntegrator(FieldIntegrator):
         rule = self.rule or march.rule
         return replace(march, samples=samples, near=None, far=None, rule=rule, stop=stop)
 
-    def _trace(self, scene: mi.Scene, placed: PlacedField, wave: Wave) -> None:
-        """Fills in ``wave.outputs``, without derivatives."""
-        rays = dr.width(wave.ray)
-        wave.outputs = [dr.zeros(mi.Float, rays) for _ in range(5)]
-        for chunk in self._chunks(placed, wave):
-            index, values, _ = self._render_chunk(scene, placed, wave, chunk)
-            for output, value in zip(wave.outputs, values, strict=True):
-                dr.scatter(output, value, index)
-            dr.eval(wave.outputs)
+    def _warn_of_surfaces(self, scene: mi.Scene) -> None:
+        if not self._warned and has_surfaces(scene):
+            mi.Log(
+                mi.LogLevel.Warn,
+                "nerf: the scene's surfaces and lights are left out without an integrator to "
+                'show them: nest one, as in <integrator type="nerf"><integrator type="path"/>'
+                "</integrator>",
+            )
+        self._warned = True
 
-    def _chunks(self, placed: PlacedField, wave: Wave) -> Iterator[tuple[int, int]]:
-        return ray_chunks(dr.width(wave.ray), self._march(placed))
 
-    def _render_chunk(
-        self,
-        scene: mi.Scene,
-        placed: PlacedField,
-        wave: Wave,
-        chunk: tuple[int, int],
-        mode: dr.ADMode = dr.ADMode.Primal,
-    ) -> tuple[Any, list[Any], Evaluation]:
-        """R, G, B, opacity and depth of some rays; leaves of the field are attached."""
-        index, o, d, jitter = slice_rays(wave.ray.o, wave.ray.d, wave.random, *chunk)
-        ray = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
-        ray.maxt = dr.gather(mi.Float, wave.ray.maxt, index)
-        local_o, local_d, scale = placed.to_local(ray.o, ray.d)
-        dr.eval(local_o, local_d, scale)
-        march, field = self._march(placed), placed.medium.field
-        samples = place_samples(
-            field,
-            local_o,
-            local_d,
-            march,
-            occupancy=placed.medium.occupancy,
-            jitter=jitter,
-            bounds=self._bounds(placed, ray, scale),
-        )
-        background = self._background(scene, ray)
-        with dr.resume_grad(when=mode != dr.ADMode.Primal):
-            stop = march.stop if mode == dr.ADMode.Primal else 0.0
-            evaluation = Evaluation(field, samples, march.block, stop=stop)
-            if mode != dr.ADMode.Primal:
-                evaluation.enable_grad()
-            if mode == dr.ADMode.Forward:
-                evaluation.forward()
-            seen = integrate(evaluation, samples)
-            values = self._in_front(field, seen.color, seen.opacity, background)
-            values += [seen.opacity, seen.depth / scale]
-        return index, values, evaluation
-
-    def _chunk_backward(
-        self, scene: mi.Scene, placed: PlacedField, wave: Wave, chunk: Any, gradients: list[Any]
-    ) -> None:
-        index, values, evaluation = self._render_chunk(
-            scene, placed, wave, chunk, dr.ADMode.Backward
-        )
-        with dr.resume_grad():
-            for value, gradient in zip(values, gradients, strict=True):
-                dr.set_grad(value, dr.gather(mi.Float, gradient, index))
-                dr.enqueue(dr.ADMode.Backward, value)
-            dr.traverse(dr.ADMode.Backward)
-            evaluation.backward()
-
-    def _chunk_forward(
-        self, scene: mi.Scene, placed: PlacedField, wave: Wave, chunk: Any, tangents: list[Any]
-    ) -> None:
-        index, values, _ = self._render_chunk(scene, placed, wave, chunk, dr.ADMode.Forward)
-        with dr.resume_grad():
-            # The opacity is an output and an input of the colours: keep interior gradients.
-            dr.forward_to(values, flags=dr.ADFlag.ClearEdges)
-            slopes = [dr.grad(value) for value in values]
-        for tangent, slope in zip(tangents, slopes, strict=True):
-            dr.scatter(tangent, slope, index)
-        dr.eval(tangents)
+def _traced(stage: Stage, waves: Iterable[StageWave]) -> Iterator[StageWave]:
+    for wave in waves:
+        stage.trace(wave)
+        yield wave
 
 
 mi.register_integrator("nerf", NerfIntegrator)

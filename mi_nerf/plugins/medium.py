@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..closed_form import closed_form
 from ..errors import InputError
@@ -33,6 +35,11 @@ class NerfMedium(mi.Medium):
      * - occupancy
        - |bool|
        - Skip the cells that the field file marks as empty. (Default: true)
+     * - to_world
+       - |transform|
+       - Moves the field within the cube's coordinate system: applied before the cube's own
+         ``to_world``. Any affine map that is not singular. (Default: none, i.e. identity)
+       - |exposed|, |differentiable|
      * - (weights)
        - |tensor|
        - All tensors of the network, e.g. ``trunk_0_weight``, or the formula's parameters.
@@ -105,12 +112,18 @@ class NerfMedium(mi.Medium):
     coordinate system into the scene: with the identity the field appears where it was
     trained, and moving, rotating or scaling the cube does the same to the field. The
     field fills its own box, which need not be the cube [−1, 1]³; ``mi-nerf info`` prints it.
+    Densities are per length of the field: in a scaled cube it stays as opaque as it was.
+    Any number of cubes may hold fields, and several may share one medium. The cube itself
+    is never seen, whatever its BSDF.
     A field of a forward-facing capture lives in normalised device coordinates: in its own
     coordinate system it fills all of z ≤ −1 that the views saw, up to infinity, for rays
     that descend along −z.
 
+    Gradients with respect to the field's pose reach the medium's ``to_world`` and the cube's
+    ``vertex_positions``.
+
     Only the integrators ``nerf`` and ``nerf_tracking`` show it: Mitsuba's own volume
-    integrators have no notion of emission that depends on direction.
+    integrators have no notion of emission that depends on direction, and see a vacuum instead.
 
     .. tabs::
         .. code-tab:: xml
@@ -132,6 +145,8 @@ class NerfMedium(mi.Medium):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self._use_occupancy = bool(props.get("occupancy", True))
+        matrix = props.get("to_world", mi.ScalarTransform4f()).matrix
+        self.to_world = mi.Transform4f(np.array(matrix, np.float32))
         self._grid: Any = None
         self.field: Any
         if "field" in props:
@@ -153,7 +168,7 @@ class NerfMedium(mi.Medium):
         if "filename" in props:
             raise InputError("nerfmedium: both 'filename' and 'field', expected one of them")
         self._source = str(props["field"])
-        values = {n: _plain(props[n]) for n in props.unqueried() if n != "to_world"}
+        values = {n: _plain(props[n]) for n in props.unqueried()}
         try:
             self.field = closed_form(self._source, values, mi.TensorXf)
         except ValueError as error:
@@ -166,15 +181,31 @@ class NerfMedium(mi.Medium):
         return self._grid if self._use_occupancy else None
 
     def traverse(self, callback: Any) -> None:
-        """Exposes every tensor of the network as a differentiable parameter."""
+        """Exposes every tensor of the network, and ``to_world``, as differentiable parameters."""
         parameters = self.field.parameters()
         for public, name in self._names.items():
             callback.put(public, parameters[name], mi.ParamFlags.Differentiable)
+        callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str] | None = None) -> None:
         """New weights may fill cells that were empty: the grid no longer holds."""
         if keys is None or any(k in self._names for k in keys):
             self._grid = None
+
+    # ---- What Mitsuba's own volume integrators find: nothing. Theirs would fail otherwise, ----
+    # ---- in any scene, as long as a field exists anywhere.                                 ----
+
+    def intersect_aabb(self, ray: Any) -> tuple[Any, Any, Any]:
+        """No ray meets anything."""
+        return mi.Bool(False), mi.Float(0), mi.Float(dr.inf)
+
+    def get_majorant(self, interaction: Any, active: Any = True) -> Any:
+        """Nothing scatters or absorbs."""
+        return mi.UnpolarizedSpectrum(0)
+
+    def get_scattering_coefficients(self, interaction: Any, active: Any = True) -> Any:
+        """Scattering, null and total coefficients: none."""
+        return tuple(mi.UnpolarizedSpectrum(0) for _ in range(3))
 
     def to_string(self) -> str:
         """Lists the settings."""

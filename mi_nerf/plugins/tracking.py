@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
@@ -11,10 +12,26 @@ import mitsuba as mi
 
 from ..errors import InputError
 from ..majorant import Majorants
+from ..quadrature import over_background
 from ..tracking import track
 from ..volume import ray_segments
+from .backdrop import Environment
 from .camera import FieldIntegrator, Wave
-from .placement import PlacedField
+from .crossing import Marched
+from .placement import find_fields
+
+
+@dataclass
+class TrackedWave(Wave):
+    """Camera rays, and an estimate of what they see."""
+
+    color: list[Any] = field(default_factory=list)  # in front of the environment
+    opacity: Any = None
+
+    def shown(self) -> dict[str, Any]:
+        """Colour and opacity."""
+        color = mi.Color3f(*self.color)
+        return {"color": color, "alpha": self.opacity, "opacity": self.opacity}
 
 
 class NerfTrackingIntegrator(FieldIntegrator):
@@ -75,6 +92,7 @@ class NerfTrackingIntegrator(FieldIntegrator):
 
     plugin = "nerf_tracking"
     known = ("opacity",)
+    wave = TrackedWave
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -114,29 +132,41 @@ class NerfTrackingIntegrator(FieldIntegrator):
         state = (mi.UInt64(second[0]) << 32) | mi.UInt64(second[1])
         return mi.PCG32(initstate=state, initseq=dr.arange(mi.UInt64, rays))
 
-    def _traced(
-        self, scene: mi.Scene, placed: PlacedField, waves: Iterable[Wave]
-    ) -> Iterator[Wave]:
-        medium, field = placed.medium, placed.medium.field
-        if field.color_space == "srgb" and not self.encoded:
+    def _traced(self, scene: mi.Scene, waves: Iterable[TrackedWave]) -> Iterator[TrackedWave]:
+        marched = self._marched(scene)
+        tracked, medium = marched.field, marched.placed.medium
+        encoded = tracked.color_space == "srgb"
+        environment = Environment(scene, self.show_background, encoded)
+        fixed = self.majorant is not None
+        if fixed:
+            majorants = Majorants.constant(tracked, self.majorant, medium.occupancy, mi.Float)
+        else:
+            majorants = Majorants.seen(tracked, medium.occupancy, mi.Float)
+        for wave in waves:
+            o, d, scale = marched.placed.to_local(wave.ray.o, wave.ray.d)
+            segments = ray_segments(tracked, o, d, marched.bounds(wave.ray.maxt, scale))
+            block = medium.march.block
+            seen = track(tracked, segments, majorants, wave.random, grow=not fixed, block=block)
+            behind = environment.look(wave.ray, wave.sampler).radiance
+            wave.color = over_background(seen.color, seen.opacity, behind)
+            wave.opacity = seen.opacity
+            yield wave
+
+    def _marched(self, scene: mi.Scene) -> Marched:
+        """The field of the scene."""
+        placed = find_fields(scene)
+        if len(placed) > 1:
+            raise InputError(
+                f"nerf_tracking: the scene holds {len(placed)} fields, expected one "
+                "('nerf' shows several)"
+            )
+        marched = Marched(placed[0], placed[0].medium.march, self.near, self.far)
+        if marched.field.color_space == "srgb" and not self.encoded:
             raise InputError(
                 "nerf_tracking: the field was trained on sRGB images, and decoding what is "
                 "composited in sRGB would be biased, expected encoded=true"
             )
-        fixed = self.majorant is not None
-        if fixed:
-            majorants = Majorants.constant(field, self.majorant, medium.occupancy, mi.Float)
-        else:
-            majorants = Majorants.seen(field, medium.occupancy, mi.Float)
-        for wave in waves:
-            o, d, scale = placed.to_local(wave.ray.o, wave.ray.d)
-            segments = ray_segments(field, o, d, self._bounds(placed, wave.ray, scale))
-            block = medium.march.block
-            seen = track(field, segments, majorants, wave.random, grow=not fixed, block=block)
-            background = self._background(scene, wave.ray)
-            color = self._in_front(field, seen.color, seen.opacity, background)
-            wave.outputs = [*color, seen.opacity]
-            yield wave
+        return marched
 
 
 _NO_DERIVATIVES = "nerf_tracking: has no derivatives, expected the integrator 'nerf' for them"
