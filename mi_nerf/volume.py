@@ -290,8 +290,7 @@ class Evaluation:
             self._evaluate(samples.index, keep)
             return
         rounds = [self._evaluate(index, keep) for index in self._front_to_back(stop)]
-        uint = type(samples.index)
-        self.asked = dr.concat(rounds) if rounds else dr.zeros(uint, 0)
+        self.asked = _joined(rounds, type(samples.index))
 
     def _evaluate(self, index: Any, keep: bool) -> Any:
         """Fills in the samples ``index``, and returns it."""
@@ -435,12 +434,26 @@ def _private_sums() -> Iterator[None]:
         dr.set_expand_threshold(before)
 
 
+def _joined(parts: list[Any], uint: Any) -> Any:
+    """One array after the other; ``dr.concat`` would compile kernels for their lengths."""
+    total = dr.zeros(uint, sum(len(part) for part in parts))
+    dr.make_opaque(total)
+    start = 0
+    for part in parts:
+        dr.scatter(total, part, dr.arange(uint, len(part)) + dr.opaque(uint, start))
+        start += len(part)
+    dr.eval(total)
+    return total
+
+
 def _rank_in_ray(ray: Any, rays: int) -> Any:
     """How many samples of the same ray come before each one; ``ray`` ascends."""
     uint = type(ray)
     place = dr.arange(uint, len(ray))
-    first = dr.full(uint, len(ray), rays)
-    dr.scatter_reduce(dr.ReduceOp.Min, first, place, ray)
+    before = dr.gather(uint, ray, place - 1, place > 0)
+    first = dr.zeros(uint, rays)
+    dr.make_opaque(first)
+    dr.scatter(first, place, ray, (place == 0) | (before != ray))
     rank = place - dr.gather(uint, first, ray)
     dr.eval(rank)
     return rank

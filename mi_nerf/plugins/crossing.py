@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..arrays import gather_vector3
 from ..color import srgb_to_linear
@@ -83,17 +85,22 @@ class Rays:
 
 def chunks(fields: list[Marched], rays: Rays) -> Iterator[tuple[Any, Rays]]:
     """The rays that cross any field, in parts of bounded memory, with their numbers."""
-    hit = fields[0].hit(rays)
-    for marched in fields[1:]:
-        hit |= marched.hit(rays)
-    crossing = mi.UInt32(dr.compress(hit & dr.full(mi.Bool, True, len(rays.o[0]))))
-    samples = sum(m.march.samples + m.march.fine for m in fields)
-    size = max(1, min(m.march.chunk for m in fields) // samples)
-    for start in range(0, len(crossing), size):
-        count = min(size, len(crossing) - start)
-        slot = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start)
-        index = dr.gather(mi.UInt32, crossing, slot)
-        yield index, rays.take(index)
+    samples = dr.zeros(mi.UInt32, len(rays.o[0]))  # of all fields along each ray
+    for marched in fields:
+        count = dr.opaque(mi.UInt32, marched.march.samples + marched.march.fine)
+        samples += dr.select(marched.hit(rays), count, 0)
+    dr.eval(samples)
+    crossing = mi.UInt32(dr.compress(samples > 0))
+    if not len(crossing):
+        return
+    total = dr.cumsum(dr.gather(mi.UInt32, samples, crossing))
+    limit = max(1, min(m.march.chunk for m in fields))
+    ends = np.searchsorted(np.array(total), limit * np.arange(1, int(total[-1]) // limit + 2))
+    for start, end in pairwise([0, *ends.tolist()]):
+        slot = dr.arange(mi.UInt32, end - start) + dr.opaque(mi.UInt32, start)
+        if len(slot):
+            index = dr.gather(mi.UInt32, crossing, slot)
+            yield index, rays.take(index)
 
 
 class View:
