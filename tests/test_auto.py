@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from tests.datasets import blob_images, orbit_poses, write_blender_dataset
 
 VIEWS, SIZE = 20, 20
 SMALL = ["occupancy.resolution=16", "grid.levels=3", "grid.log2_entries=10", "grid.finest=32"]
+SMALL += ["sampling.samples=32", "network.width=32", "network.view_width=32"]
 
 
 def views_of(folder: Path, **kind: bool) -> Dataset:
@@ -236,8 +237,7 @@ def test_what_the_user_sets_is_neither_probed_nor_changed(script: Any) -> None:
 def test_directions_are_seen_where_they_matter(
     kind: str, diffuse: Dataset, mirror: Dataset
 ) -> None:
-    settings = ["sampling.samples=32", "network.width=32", "network.view_width=32", *SMALL]
-    config = start(*settings, steps=2000)
+    config = start(*SMALL, steps=2000)
     data = {"diffuse": diffuse, "mirror": mirror}[kind]
     config, decisions = choose(config, data, llvm)
     assert config.network.view_dependent == (kind == "mirror"), decisions
@@ -263,10 +263,8 @@ def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(probes, "_PACED", 2)
 
 
-def prober(data: Dataset, config: TrainConfig, clock: Iterator[float] | None = None) -> Probes:
-    cells = np.ones((16, 16, 16), bool)
-    ticks = (lambda: 0.0) if clock is None else (lambda: next(clock))
-    return Probes(config, data, llvm, cells, ticks)
+def prober(data: Dataset, config: TrainConfig, clock: Callable[[], float] = lambda: 0.0) -> Probes:
+    return Probes(config, data, llvm, np.ones((16, 16, 16), bool), clock)
 
 
 def test_views_are_held_back(diffuse: Dataset) -> None:
@@ -296,29 +294,24 @@ def test_probes_keep_to_their_share_of_steps(
 def test_probes_keep_to_their_share_of_seconds(
     diffuse: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By a clock that goes on by a second each time that anyone looks."""
+    """By a clock on which a step takes a second, and nothing else any time."""
     steps = counted(monkeypatch)
-    config = start(*SMALL, "sampling.batch=1024", max_seconds=300.0)
-    now = [0.0]
-
-    def tick() -> float:
-        now[0] += 1.0
-        return now[0]
-
-    runs = Probes(config, diffuse, llvm, np.ones((16, 16, 16), bool), tick)
+    config = start(*SMALL, max_seconds=300.0)
+    runs = prober(diffuse, config, lambda: float(len(steps)))
     first = runs.train(config)
-    assert first is not None and 4 <= first.steps < 32  # of the 32 that a long run would take
-    assert first.seconds == 1.0 and now[0] <= 1 + 18 + 4
-    while runs.train(config, like=first) is not None:
-        pass
-    assert now[0] <= 1 + 36 + 4  # looks after the last step besides
-    before = len(steps)
-    assert runs.train(config) is None and len(steps) == before
+    # A half of 36 seconds, of which a tenth is kept in reserve after the first two steps.
+    assert first is not None and first.steps == len(steps) == 2 + int(0.9 * 16)
+    assert first.seconds == 1.0
+    assert runs.affords(20, 10**9) and not runs.affords(21, 1)
+    assert runs.train(config, like=first) is not None
+    assert runs.train(config, like=first) is None
+    assert len(steps) == 36 == probes.SHARE * 300
+    assert runs.train(config) is None and len(steps) == 36
 
 
 @pytest.mark.usefixtures("short")
 def test_probes_depend_on_the_seed_alone(diffuse: Dataset) -> None:
-    config = start(*SMALL, "sampling.batch=1024", steps=1000)
+    config = start(*SMALL, steps=100)
     found = [prober(diffuse, replace(config, seed=s)).train(config) for s in (0, 0)]
     assert found[0].quality == found[1].quality and found[0].averaged == found[1].averaged
     other = prober(diffuse, config).train(replace(config, seed=1))
@@ -332,11 +325,11 @@ def test_a_run_records_and_shows_its_reasons(
     diffuse: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
-    options = ["--preset", "auto", "--steps", "3", "--set", *SMALL, "network.width=64"]
+    options = ["--preset", "auto", "--steps", "3", "--set", *SMALL]
     assert main(["train", str(diffuse.path), "--out", str(out), *options]) == 0
     said = capsys.readouterr().out
     config, record = training.read_config(out)
-    assert config.preset == "auto" and config.grid.finest == 32 and config.network.width == 64
+    assert config.preset == "auto" and config.grid.finest == 32 and config.network.width == 32
     settings = [entry["setting"] for entry in record["auto"]]
     assert "box" in settings and "network.view_dependent" in settings
     assert "network.width" not in settings and "grid.finest" not in settings

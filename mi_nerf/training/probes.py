@@ -73,7 +73,8 @@ class Probes:
             self._deadline = clock() + SHARE * config.max_seconds
             goal *= min(max(config.max_seconds / 60, 1), 4)
         if config.steps is not None:
-            self._steps_left = SHARE * config.steps * config.sampling.batch / BATCH
+            batch = config.sampling.batch
+            self._steps_left = SHARE * config.steps * batch / min(BATCH, batch)
             goal = min(goal, self._steps_left / 2)  # two at least, to compare
         self._goal = int(goal)
 
