@@ -150,6 +150,8 @@ class Samples:
         is an array of one element, which the host need not wait for.
         """
         uint, queries = type(self.index), self.queries
+        if not queries:
+            return dr.opaque(uint, self.rays)
         after = dr.opaque(uint, budget)
         lost = after < dr.opaque(uint, queries)  # the same kernels, whether or not there are any
         first_lost = dr.gather(uint, self.index, after, lost)
