@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -315,6 +316,43 @@ def test_the_medium_moves_within_its_cube() -> None:
     np.testing.assert_allclose(render(scene), image, atol=2e-5)
 
 
+def test_xml() -> None:
+    """Nested integrators need no name there; Mitsuba merges meshes of such scenes."""
+    xml = """<scene version="3.0.0">
+        <integrator type="nerf"><integrator type="path"/></integrator>
+        <sensor type="perspective">
+            <float name="fov" value="40"/>
+            <transform name="to_world">
+                <lookat origin="0.3, -4, 0.5" target="0, 0, 0" up="0, 0, 1"/>
+            </transform>
+            <film type="hdrfilm">
+                <integer name="width" value="16"/><integer name="height" value="12"/>
+                <string name="pixel_format" value="rgba"/><rfilter type="box"/>
+            </film>
+            <sampler type="independent"><integer name="sample_count" value="1"/></sampler>
+        </sensor>
+        <shape type="cube"><bsdf type="null"/>
+            <medium type="nerfmedium" name="interior"><string name="field" value="slab"/></medium>
+        </shape>
+        <shape type="cube"><bsdf type="null"/>
+            <medium type="nerfmedium" name="interior"><string name="field" value="shell"/></medium>
+        </shape>
+        <shape type="cube">
+            <transform name="to_world"><scale value="0.2"/><translate y="-1.1"/></transform>
+        </shape>
+        <emitter type="constant"/>
+    </scene>"""
+    image = np.array(mi.render(mi.load_string(xml)))
+    same = scene_of(
+        nerf(),
+        one=formula_dict("slab"),
+        two=formula_dict("shell"),
+        block={"type": "cube", "to_world": place().translate([0, -1.1, 0]).scale(0.2)},
+        sky={"type": "constant"},
+    )
+    np.testing.assert_allclose(image, render(same), atol=1e-4)
+
+
 # ---- Surfaces -------------------------------------------------------------------
 
 
@@ -519,6 +557,10 @@ def test_gradients_agree_with_finite_differences(kind: str, nested: str, tmp_pat
     changes, step, tolerance = CHANGES[kind]
     file = small_file(tmp_path, density_activation="softplus")
     scene = interlocked(nested, file)
+    if nested == "prb":  # in several chunks
+        for shape in scene.shapes():
+            if (medium := shape.interior_medium()) is not None:
+                medium.march = replace(medium.march, chunk=60_000, block=2048)
     params = mi.traverse(scene)
     start = {key: params[key] + 0 if "to_world" not in key else None for key in changes}
     pull = mi.TensorXf(np.random.default_rng(0).normal(size=(SIZE[1], SIZE[0], 5)))

@@ -93,9 +93,9 @@ def chunks(fields: list[Marched], rays: Rays) -> Iterator[tuple[Any, Rays]]:
     crossing = mi.UInt32(dr.compress(samples > 0))
     if not len(crossing):
         return
-    total = dr.cumsum(dr.gather(mi.UInt32, samples, crossing))
-    limit = max(1, min(m.march.chunk for m in fields))
-    ends = np.searchsorted(np.array(total), limit * np.arange(1, int(total[-1]) // limit + 2))
+    total = np.cumsum(np.array(dr.gather(mi.UInt32, samples, crossing)), dtype=np.int64)
+    limit = min(marched.march.chunk for marched in fields)
+    ends = np.searchsorted(total, limit * np.arange(1, total[-1] // limit + 2))
     for start, end in pairwise([0, *ends.tolist()]):
         slot = dr.arange(mi.UInt32, end - start) + dr.opaque(mi.UInt32, start)
         if len(slot):
@@ -139,8 +139,9 @@ class View:
                 dr.enqueue(dr.ADMode.Backward, value)
             dr.traverse(dr.ADMode.Backward)
             for crossing in self._crossings:
-                crossing.evaluation.backward()
-                crossing.moving.backward()
+                if crossing.differentiable:
+                    crossing.evaluation.backward()
+                    crossing.moving.backward()
 
     def forward(self) -> list[Any]:
         """The derivatives of ``values`` along the gradients of weights and places."""
@@ -201,6 +202,7 @@ class _Crossing:
         self, number: int, marched: Marched, ray: Any, rays: Rays, mode: dr.ADMode
     ) -> None:
         self.number, self.field, self.ray = number, marched.field, ray
+        self.differentiable = mode != dr.ADMode.Primal and marched.differentiable
         self._placed, self._march, self.moving = marched.placed, marched.march, _Moving()
         self.color_space = "linear" if marched.encoded else self.field.color_space
         moving = mode != dr.ADMode.Primal and self._placed.moves
@@ -232,7 +234,7 @@ class _Crossing:
         """Makes the field's answers the leaves of what is computed next."""
         if mode != dr.ADMode.Primal:
             self.evaluation.enable_grad()
-        if mode == dr.ADMode.Forward:
+        if mode == dr.ADMode.Forward and self.differentiable:
             self.moving.forward()
             self.evaluation.forward()
 
