@@ -22,10 +22,11 @@ from .trainer import Trainer
 
 SHARE = 0.12  # of a run's budget, for all probes together
 BATCH = 4096  # field queries a step of a probe, at most
-STEPS = 350  # of a probe in a run of a minute or less; four times as many in longer ones
-FEWEST = 200  # a shorter probe tells nothing
+STEPS = 350  # of a probe in a run of two minutes or less; up to four times as many in longer ones
+FEWEST = 250  # a shorter probe tells nothing
 FEWEST_VIEWS = 5  # with fewer there is none to hold back
 _MOST_VIEWS = 8  # to hold back
+_FIRST = 0.65  # of the seconds left, for a first probe: it may have to compile
 _PACED = 40  # steps after which it is clear how many there is time for
 _PIXELS = 16384  # held-back ones that judge a field, at most
 _SEED = 77  # of their choice, the same for all probes
@@ -71,7 +72,7 @@ class Probes:
         self._deadline, self._steps_left, goal = math.inf, math.inf, float(STEPS)
         if config.max_seconds is not None:
             self._deadline = clock() + SHARE * config.max_seconds
-            goal *= min(max(config.max_seconds / 60, 1), 4)
+            goal *= min(max(config.max_seconds / 120, 1), 4)
         if config.steps is not None:
             batch = config.sampling.batch
             self._steps_left = SHARE * config.steps * batch / min(BATCH, batch)
@@ -91,10 +92,11 @@ class Probes:
 
         Args:
             like: the probe to compare with, whose number of steps is taken. Without it,
-                half of what is left of the budget stays for such a comparison.
+                some of the budget stays for such a comparison.
         """
         now = self._clock()
-        limit = self._deadline if like is not None else now + (self._deadline - now) / 2
+        share = _FIRST if like is None else 1.0
+        limit = now + share * (self._deadline - now) if math.isfinite(self._deadline) else math.inf
         goal = self._goal if like is None else like.steps
         if goal < FEWEST or not self.affords(0, goal):
             return None
