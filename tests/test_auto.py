@@ -29,6 +29,7 @@ from tests.datasets import blob_images, orbit_poses, write_blender_dataset
 VIEWS, SIZE = 20, 20
 SMALL = ["occupancy.resolution=16", "grid.levels=3", "grid.log2_entries=10", "grid.finest=32"]
 SMALL += ["sampling.samples=32", "network.width=32", "network.view_width=32"]
+FOURIER = ["grid=none", "position.frequencies=4", "occupancy.resolution=16", *SMALL[-3:]]
 
 
 def views_of(folder: Path, **kind: bool) -> Dataset:
@@ -323,7 +324,8 @@ def test_probes_keep_to_their_share_of_seconds(
 
 @pytest.mark.usefixtures("short")
 def test_probes_depend_on_the_seed_alone(diffuse: Dataset) -> None:
-    config = start(*SMALL, steps=100)
+    """Without a hash grid, whose gradients are summed in the order of threads."""
+    config = start(*FOURIER, steps=100)
     found = [prober(diffuse, replace(config, seed=s)).train(config) for s in (0, 0)]
     assert found[0].quality == found[1].quality and found[0].averaged == found[1].averaged
     other = prober(diffuse, config).train(replace(config, seed=1))

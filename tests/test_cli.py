@@ -611,7 +611,7 @@ NERF = """<scene version="3.0.0"><integrator type="nerf"/><sensor type="perspect
         ),
         (
             '<scene version="3.0.0"><integrator type="nerf"/><sensor type="perspective"/></scene>',
-            "the scene holds 0 shapes with a 'nerfmedium', expected exactly one",
+            "the scene holds no 'nerfmedium', expected at least one",
         ),
         (NERF.format(shape="cube", field="qqq.safetensors"), "qqq.safetensors: not found"),
         (NERF.format(shape="cube", field="bad.safetensors"), "not a complete safetensors file"),
