@@ -590,6 +590,19 @@ def test_gradients_agree_with_finite_differences(kind: str, nested: str, tmp_pat
     assert float(dr.grad(loss).array[0]) == pytest.approx(float(dr.grad(x)[0]), rel=1e-3)
 
 
+def test_the_environment_is_differentiable() -> None:
+    """Without a nested integrator; what passes the field is its derivative."""
+    scene = mi.load_dict(scene_of(nerf(None), sky=sky(), field=slab(place(), 0.7, GLOW)))
+    params = mi.traverse(scene)
+    key = "sky.radiance.value"
+    dr.enable_grad(params[key])
+    params.update()
+    image = mi.render(scene, params, seed=1, seed_grad=2)
+    dr.backward(dr.sum(image, axis=None))
+    through = (1 - render(scene, seed=2)[..., 3]).sum()
+    np.testing.assert_allclose(np.ravel(dr.grad(params[key])), [through] * 3, rtol=1e-5)
+
+
 # ---- Bad input ------------------------------------------------------------------
 
 
