@@ -30,7 +30,7 @@ def view_box(dataset: Dataset) -> tuple[Corner, Corner]:
     distance = float(np.median(np.linalg.norm(origin - center, axis=1)))
     i = dataset.intrinsics
     half = 1.05 * distance * max(i.width / i.fx, i.height / i.fy) / 2
-    if not half > 0:
+    if half <= 1e-9 * np.abs(origin).max():  # one camera, or several in one place: anything
         half = 1.0
     return _corner(center - half), _corner(center + half)
 

@@ -13,7 +13,7 @@ import pytest
 
 import mi_nerf  # noqa: F401
 from mi_nerf.color import srgb_to_linear
-from mi_nerf.plugins.placement import cube_to_world
+from mi_nerf.plugins.placement import cubes_to_world
 from tests.fields import scene_dict, small_file, weight_keys
 
 VARIANTS = ["llvm_ad_rgb", pytest.param("cuda_ad_rgb", marks=pytest.mark.cuda)]
@@ -155,7 +155,7 @@ def test_cube_to_world_is_recovered(variant: str) -> None:
     )
     cube = mi.load_dict({"type": "cube", "to_world": transform})
     expected = np.array(transform.matrix, np.float64).reshape(4, 4)
-    np.testing.assert_allclose(cube_to_world(cube), expected, atol=2e-6)
+    np.testing.assert_allclose(cubes_to_world(cube), [expected], atol=2e-6)
 
 
 def test_box_outside_the_unit_cube_appears_where_it_was_trained(

@@ -296,7 +296,15 @@ def test_row_18_training_on_next_to_nothing(ad: Any, count: int, width: int, hei
         cam_to_world=poses,
         intrinsics=Intrinsics.from_angle_x(width, height, 0.6),
     )
-    assert np.isfinite(losses(Trainer(small(), dataset, ad), 9)).all()
+    trainer = Trainer(small(), dataset, ad)
+    assert np.isfinite(losses(trainer, 9)).all()
+    assert trainer.step(5e-3).queries > 0
+
+
+def test_row_18_steps_that_see_nothing(ad: Any, views: Dataset) -> None:
+    """All views look away from the box."""
+    config = small("box=20,20,20,21,21,21")
+    assert np.isfinite(losses(Trainer(config, views, ad), 9)).all()
 
 
 def test_row_18_one_ray_and_one_sample_a_step(ad: Any, views: Dataset) -> None:

@@ -15,11 +15,11 @@ from ..arrays import gather_vector3
 from ..color import srgb_to_linear
 from ..errors import InputError
 from ..merging import Layer, integrate_merged, merge
+from ..normals import density_gradient
 from ..volume import (
     Evaluation,
     MarchSettings,
     RaySegments,
-    density_gradient,
     integrate,
     place_samples,
     ray_segments,

@@ -15,6 +15,8 @@ from ..errors import InputError
 
 Matrix = np.ndarray[Any, Any]
 
+_CORNERS = 24  # vertices of Mitsuba's cube: four for each face
+
 
 @dataclass
 class PlacedField:
@@ -22,13 +24,14 @@ class PlacedField:
 
     medium: Any
     shape: Any
+    number: int  # of the cube among those that Mitsuba has merged into the shape
     to_world: Matrix  # (4, 4), affine: from field to world coordinates
 
     @property
     def moves(self) -> bool:
         """Whether gradients with respect to the place are wanted."""
         with dr.resume_grad():
-            history = self.medium.to_world.matrix, _vertices(self.shape)
+            history = self.medium.to_world.matrix, _vertices(self.shape, self.number)
             return bool(dr.grad_enabled(history))
 
     def to_local(self, o: Any, d: Any, *, moving: bool = False) -> tuple[Any, Any, Any]:
@@ -49,6 +52,12 @@ class PlacedField:
         scale = dr.norm(local_d)
         return local_o, local_d / scale, scale
 
+    def _cube_matrix(self) -> list[list[Any]]:
+        """The matrix of the cube with the history of its vertices: three rows of four."""
+        points = _vertices(self.shape, self.number)
+        columns = [upload(mi.Float, column) for column in _from_corners().T]
+        return [[dr.sum(points[i] * column) for column in columns] for i in range(3)]
+
     def normal_to_world(self, gradient: list[Any]) -> list[Any]:
         """Unit vectors against N gradients in field coordinates; 0 where these vanish."""
         inverse = np.linalg.inv(self.to_world[:3, :3])
@@ -59,7 +68,7 @@ class PlacedField:
 
     def _change_of_inverse(self, inverse: list[list[Any]]) -> list[list[Any]]:
         """Zeros whose derivatives are those of the inverse M⁻¹: −M⁻¹ dM M⁻¹."""
-        matrix = _product(_cube_matrix(self.shape), _rows(self.medium.to_world.matrix))
+        matrix = _product(self._cube_matrix(), _rows(self.medium.to_world.matrix))
         change = [[dr.detach(x) - x for x in row] for row in matrix]
         last = [mi.Float(x) for x in (0, 0, 0, 1)]
         return _product(_product([row[:3] for row in inverse], change), [*inverse, last])
@@ -67,6 +76,8 @@ class PlacedField:
 
 def find_fields(scene: mi.Scene) -> list[PlacedField]:
     """The radiance fields of a scene, in the alphabetical order of their cubes' ids.
+
+    Cubes that Mitsuba has merged follow each other in their order.
 
     Raises:
         InputError: if there is none, one is not in a cube or squashed flat, several include
@@ -87,7 +98,10 @@ def find_fields(scene: mi.Scene) -> list[PlacedField]:
                     f"nerfmedium: the cube '{shape.id()}' is a light source, "
                     "expected one that only holds a field"
                 )
-            found.append(PlacedField(medium, shape, field_to_world(shape, medium)))
+            inner = np.array(medium.to_world.matrix, np.float64).reshape(4, 4)
+            _check_volume(inner, "the medium's to_world")
+            for number, outer in enumerate(cubes_to_world(shape)):
+                found.append(PlacedField(medium, shape, number, outer @ inner))
     if not found:
         raise InputError("nerf: the scene holds no 'nerfmedium', expected at least one, in a cube")
     if len(found) > 1 and any(placed.medium.field.ndc is not None for placed in found):
@@ -103,32 +117,33 @@ def is_field(medium: Any) -> bool:
     return hasattr(medium, "field") and hasattr(medium, "march")
 
 
-def field_to_world(shape: mi.Shape, medium: Any) -> Matrix:
-    """Field to world coordinates: the medium's ``to_world``, then that of its cube.
+def cubes_to_world(shape: mi.Shape) -> list[Matrix]:
+    """The ``to_world`` of a ``cube``, or of each of several, recovered from their corners.
+
+    Mitsuba merges cubes that share medium and BSDF into one mesh when it loads a scene.
 
     Raises:
-        InputError: as :func:`cube_to_world`, or for a singular ``to_world`` of the medium.
+        InputError: if the shape is no cube, or one is squashed flat.
     """
-    inner = np.array(medium.to_world.matrix, np.float64).reshape(4, 4)
-    _check_volume(inner, "the medium's to_world")
-    return cube_to_world(shape) @ inner
+    count, rest = divmod(shape.vertex_count() if shape.is_mesh() else 0, _CORNERS)
+    if rest or not count:
+        raise _no_cube(shape)
+    found = []
+    for number in range(count):
+        points = np.array(_vertices(shape, number), np.float64).reshape(3, -1)
+        to_world = np.eye(4)
+        to_world[:3] = points @ _from_corners()
+        _check_volume(to_world, "the cube's to_world")
+        misfit = np.abs(to_world[:3] @ _unit_corners() - points).max()
+        if misfit > 1e-4 * np.abs(points - points.mean(axis=1, keepdims=True)).max():
+            raise _no_cube(shape)
+        found.append(to_world)
+    return found
 
 
-def cube_to_world(shape: mi.Shape) -> Matrix:
-    """The ``to_world`` of a ``cube``, recovered from its corners.
-
-    Raises:
-        InputError: if the shape is no cube, or is squashed flat.
-    """
-    if shape.class_name() != "Cube":
-        raise InputError(
-            f"nerfmedium: inside a shape of type '{shape.class_name()}', expected a 'cube'"
-        )
-    points = np.array(_vertices(shape), np.float64).reshape(3, -1)
-    to_world = np.eye(4)
-    to_world[:3] = points @ _from_corners()
-    _check_volume(to_world, "the cube's to_world")
-    return to_world
+def _no_cube(shape: mi.Shape) -> InputError:
+    kind = shape.class_name()
+    return InputError(f"nerfmedium: inside a shape of type '{kind}', expected a 'cube'")
 
 
 def _check_volume(matrix: Matrix, what: str) -> None:
@@ -138,22 +153,22 @@ def _check_volume(matrix: Matrix, what: str) -> None:
 
 
 @lru_cache(maxsize=1)
+def _unit_corners() -> Matrix:
+    """(4, 24): homogeneous corners of a cube that was not moved, three times each."""
+    points = np.array(_vertices(mi.load_dict({"type": "cube"}), 0), np.float64).reshape(3, -1)
+    return np.concatenate([points, np.ones((1, _CORNERS))])
+
+
+@lru_cache(maxsize=1)
 def _from_corners() -> Matrix:
     """(24, 4): what turns the corners of a moved cube into its matrix, by least squares."""
-    points = np.array(_vertices(mi.load_dict({"type": "cube"})), np.float64).reshape(3, -1)
-    return np.linalg.pinv(np.concatenate([points, np.ones((1, points.shape[1]))]))
+    return np.linalg.pinv(_unit_corners())
 
 
-def _vertices(shape: mi.Shape) -> Any:
-    """The corners of a mesh as one array of points, with their history."""
-    return shape.vertex_position(dr.arange(mi.UInt32, shape.vertex_count()))
-
-
-def _cube_matrix(shape: mi.Shape) -> list[list[Any]]:
-    """:func:`cube_to_world` with the history of the vertices: three rows of four."""
-    points = _vertices(shape)
-    columns = [upload(mi.Float, column) for column in _from_corners().T]
-    return [[dr.sum(points[i] * column) for column in columns] for i in range(3)]
+def _vertices(shape: mi.Shape, number: int) -> Any:
+    """The corners of one of a mesh's cubes as one array of points, with their history."""
+    first = dr.opaque(mi.UInt32, number * _CORNERS)
+    return shape.vertex_position(dr.arange(mi.UInt32, _CORNERS) + first)
 
 
 def _rows(matrix: Any) -> list[list[Any]]:
