@@ -148,7 +148,8 @@ def script(
         scripted = Scripted(answers, **options)
         monkeypatch.setattr(auto, "Probes", scripted)
         given = {s.partition("=")[0] for s in settings}
-        config, decisions = choose(start(*settings), diffuse, llvm, given=given)
+        coarse = start("occupancy.resolution=16", *settings)
+        config, decisions = choose(coarse, diffuse, llvm, given=given)
         return config, decisions, scripted.asked
 
     return run

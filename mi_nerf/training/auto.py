@@ -52,7 +52,7 @@ class Decision:
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.setting} = {_text(self.value)}: {self.reason}"
+        return f"{self.setting} = {_text(self.value, '.4g')}: {self.reason}"
 
 
 def choose(
@@ -262,9 +262,10 @@ class _Questions:
         return self._runs.train(self._small(*_shape(*shape)), like=like)
 
     def _take_shape(self, shape: tuple[int, int], why: str) -> None:
-        for setting in _shape(*shape):
-            name, _, value = setting.partition("=")
-            self._choice.take(name, int(value), why)
+        depth, width = shape
+        self._choice.take("network.width", width, why)
+        self._choice.take("network.view_width", width, "as network.width")
+        self._choice.take("network.depth", depth, "with network.width")
 
     def _features(self, hashed: Probe) -> None:
         """Fourier features alone, if they have learnt more in as many steps."""
@@ -311,10 +312,12 @@ def _report(shape: tuple[int, int], probe: Probe) -> str:
     return f"{shape[0]}x{shape[1]}: {probe.quality:.2f} dB at {1e3 * probe.seconds:.1f} ms a step"
 
 
-def _text(value: Any) -> str:
-    """A value as ``--set`` takes it."""
+def _text(value: Any, form: str = "") -> str:
+    """A value as ``--set`` takes it; ``form`` is how floating-point numbers are written."""
     if isinstance(value, list):
-        return ",".join(map(_text, value))
+        return ",".join(_text(v, form) for v in value)
+    if isinstance(value, float):
+        return format(value, form)
     return "none" if value is None else str(value).lower()
 
 
