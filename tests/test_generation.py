@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import resource
 import shutil
 import subprocess
 import sys
@@ -370,17 +369,18 @@ def test_ctrl_c_of_the_command(tmp_path: Path) -> None:
 def test_a_full_disk(tmp_path: Path) -> None:
     """Files may not grow beyond a few kilobytes: one line, nothing half-written."""
     scene, out = ball(tmp_path), tmp_path / "data"
-    arguments = ["generate", scene, out, "--train", "2", "--size", "100", "100", "--spp", "4"]
-    command = [sys.executable, "-m", "mi_nerf.cli", *map(str, arguments)]
-    out_at = command.index(str(out))
-    # Compiled kernels are written to files too: have them before there is no room.
-    subprocess.run([*command[:out_at], str(tmp_path / "first"), *command[out_at + 1 :]], check=True)
-    done = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000)),
-    )
+    rest = ["--train", "2", "--size", "100", "100", "--spp", "4"]
+    # Dr.Jit writes compiled kernels to files too: the same process compiles them before.
+    script = f"""
+import resource, sys
+from mi_nerf.cli import main
+def generate(out):
+    return main(["generate", {str(scene)!r}, out, *{rest!r}])
+assert generate({str(tmp_path / "first")!r}) == 0
+resource.setrlimit(resource.RLIMIT_FSIZE, (9000, 9000))
+sys.exit(generate({str(out)!r}))
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
     assert done.stderr.startswith("mi-nerf: ") and done.stderr.count("\n") == 1
     assert "cannot be written" in done.stderr
