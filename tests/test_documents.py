@@ -129,7 +129,7 @@ def is_placeholder(text: str) -> bool:
     return bool(re.fullmatch(r"[A-Z]+|…|value|key", text))
 
 
-@pytest.mark.parametrize("line", commands())
+@pytest.mark.parametrize("line", list(commands()))
 def test_commands_are_accepted(line: str) -> None:
     words = shlex.split(line)
     if "…" in words:  # something is left out: options must exist all the same
@@ -137,12 +137,13 @@ def test_commands_are_accepted(line: str) -> None:
         options = {"--" + name.replace("_", "-") for name in command.__dataclass_fields__}
         assert {word for word in words if word.startswith("--")} <= options
         return
-    parsed = cli._parse(words)
+    parsed = cli._parse(["1" if word in ("N", "S", "K") else word for word in words])
     for assignment in getattr(parsed, "set", ()):
         key, _, value = assignment.partition("=")
         if words[0] in ("train", "ablate") and not is_placeholder(key):
-            assert key in setting_names()
-            if not is_placeholder(value):
+            if is_placeholder(value):
+                assert key in setting_names()
+            else:
                 with_settings(preset("nerf"), [assignment])
     name = getattr(parsed, "preset", "nerf")
     assert is_placeholder(name) or name in PRESETS
@@ -166,7 +167,7 @@ def python_commands() -> Iterator[Any]:
                 yield pytest.param(rest.strip(), id=f"{page.name}:{rest.strip()[:60]}")
 
 
-@pytest.mark.parametrize("line", python_commands())
+@pytest.mark.parametrize("line", list(python_commands()))
 def test_python_commands(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     words = shlex.split(line)
     if words[0] != "-m":
@@ -186,7 +187,7 @@ def test_python_commands(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
         raise AcceptedError
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
-    if options or "ArgumentParser" in Path(module.__file__ or "").read_text():
+    if options:
         with pytest.raises(AcceptedError):
             module.main()
     else:
@@ -285,7 +286,10 @@ def test_xml_examples_load(text: str, workplace: Path) -> None:
     if "<scene" not in text:
         text = f'<scene version="3.0.0">{text}</scene>'
     scene = mi.load_string(text)
-    if scene.sensors():
+    if "<sensor" in text:
+        film = mi.traverse(scene.sensors()[0])
+        film["film.size"] = [16, 12]
+        film.update()
         image = np.array(mi.render(scene, spp=1))
         assert np.isfinite(image).all() and image.any()
 
@@ -307,10 +311,8 @@ def test_the_settings_page_is_complete_and_current() -> None:
     written = text.partition(settings_page.MARK)[2]
     assert written == settings_page.tables(), "run python docs/settings.py"
     for name in setting_names():
-        (row,) = re.findall(
-            rf"^\| `{re.escape(name)}` \| [^|]+ \| [^|]+ \| (.*) \|$", written, re.M
-        )
-        assert len(row) > 0 or name == "position", name
+        row = rf"^\| `{re.escape(name)}` \| [^|]+ \| `[^|]+` \| ([^|]+) \|$"
+        assert len(re.findall(row, written, re.MULTILINE)) == 1, name
     assert "preset `auto`" in text and all(f"| `{name}`" in text for name in PRESETS)
 
 
@@ -321,11 +323,11 @@ def test_settings_named_in_the_text_exist() -> None:
         for span in spans(page):
             for part in span.replace("--set ", "").split():
                 key, _, value = part.partition("=")
-                if re.fullmatch(rf"({'|'.join(groups)})\.[a-z_0-9]+", key):
+                if re.fullmatch(rf"({'|'.join(groups)})\.(?!py$)[a-z_0-9]+", key):
                     seen += 1
                     assert key in known, f"{page.name}: {key}"
                     if value and not is_placeholder(value) and value != "…":
-                        with_settings(preset("fast"), [part])
+                        with_settings(preset("paper"), [part])
     assert seen > 20
 
 
@@ -333,7 +335,7 @@ def test_public_functions_named_in_the_text_exist() -> None:
     for page in PAGES:
         for span in spans(page):
             name = re.match(r"mi_nerf\.([\w.]+)", span)
-            if name is None:
+            if name is None or span in ("mi_nerf.field", "mi_nerf.checkpoint"):  # formats of files
                 continue
             value: Any = mi_nerf
             for part in name[1].rstrip(".").split("."):
@@ -359,7 +361,7 @@ def test_messages_of_the_error_page_are_those_of_the_code() -> None:
     texts = [" ".join(text.split()) for text in literal_texts()]
     mitsubas_own = ("Plugin ",)
     checked = 0
-    for row in re.findall(r"^\| (.*?) \| ", (ROOT / "docs/errors.md").read_text(), re.MULTILINE):
+    for row in re.findall(r"^\| (`.*?) \| ", (ROOT / "docs/errors.md").read_text(), re.MULTILINE):
         for message in re.findall(r"`([^`]+)`", row):
             if message.startswith(mitsubas_own):
                 continue
