@@ -125,7 +125,8 @@ def sweep(
     grids = Grids(subject.field, subject.occupancy, subject.backend.Float)
     exact, record = _reference(subject, seconds)
     built = {s: subject.occupancy if s.grid is None else grids.at(*s.grid) for s in settings}
-    seen, times = {}, {s: [] for s in settings}
+    seen: dict[Setting, Seen] = {}
+    times: dict[Setting, list[float]] = {s: [] for s in settings}
     for turn in range(repeats + 1):
         for setting in settings:
             elapsed, found = _render(subject, setting.march, built[setting])

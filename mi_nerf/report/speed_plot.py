@@ -38,7 +38,7 @@ def plot_speed(record: Record) -> Any:
     _known(left, reference["error"]["color"])
     left.set_ylabel(f"quadrature error of the colour\nroot mean square, {record['unit']}")
     if reference["psnr"] is not None:
-        _panel(right, record, lambda p: p["psnr"])
+        _panel(right, record, lambda p: p["psnr"], named=False)
         _model(right, reference["psnr"])
         right.set_ylabel("PSNR against the images (dB)")
     else:
@@ -57,50 +57,39 @@ def plot_speed(record: Record) -> Any:
     return figure
 
 
-def _panel(axes: Any, record: Record, value: Value) -> None:
+def _panel(axes: Any, record: Record, value: Value, *, named: bool = True) -> None:
     """Curves of the rules, marks of the other knobs, rings around the Pareto front."""
     points = [p for p in record["points"] if value(p) is not None]
-    own = record["points"][0]
+    own = [p for p in points if "own" in p["knobs"]]
     for rule, (color, line, width) in _RULES.items():
         curve = [p for p in points if p["rule"] == rule and "samples" in p["knobs"]]
         curve.sort(key=lambda p: p["samples"])
-        if not curve:
-            continue
-        x, y = [p["milliseconds"] for p in curve], [value(p) for p in curve]
-        axes.plot(x, y, line, color=color, lw=width, marker="o", ms=4, label=f"rule {rule}")
-        if rule == own["rule"]:
+        style: dict[str, Any] = {"color": color, "lw": width, "marker": "o", "ms": 4}
+        if curve:
+            axes.plot(*_places(curve, value), line, label=f"rule {rule}", **style)
+        if named and rule == record["points"][0]["rule"]:
             for point in curve:
                 fine = f"+{point['fine']}" if point["fine"] else ""
-                place = point["milliseconds"], value(point)
-                axes.annotate(
-                    f"{point['samples']}{fine}",
-                    place,
-                    (5, 5),
-                    textcoords="offset points",
-                    fontsize=8,
-                    color=color,
-                )
+                _note(axes, f"{point['samples']}{fine}", *_places([point], value), color)
     for knob, (marker, color, label) in _KNOBS.items():
-        some = [p for p in points if knob in p["knobs"] and p is not own]
+        some = [p for p in points if knob in p["knobs"] and "own" not in p["knobs"]]
         if some:
-            x, y = [p["milliseconds"] for p in some], [value(p) for p in some]
-            axes.plot(x, y, marker, color=color, ms=6, alpha=0.8, ls="", label=label)
-    if value(own) is not None:
-        place = [own["milliseconds"]], [value(own)]
-        axes.plot(*place, "*", color="k", ms=13, zorder=5, label="own settings")
+            style = {"color": color, "ms": 6, "alpha": 0.8, "ls": ""}
+            axes.plot(*_places(some, value), marker, label=label, **style)
+    axes.plot(*_places(own, value), "*", color="k", ms=13, zorder=5, ls="", label="own settings")
     front = [p for p in points if p["pareto"]]
-    x, y = [p["milliseconds"] for p in front], [value(p) for p in front]
-    axes.plot(
-        x,
-        y,
-        "o",
-        mfc="none",
-        mec="k",
-        ms=12,
-        mew=1.0,
-        ls="",
-        label="Pareto front: no other as fast and exact",
-    )
+    rings: dict[str, Any] = {"mfc": "none", "mec": "k", "ms": 12, "ls": ""}
+    label = "Pareto front: no other as fast and exact"
+    axes.plot(*_places(front, value), "o", label=label, **rings)
+
+
+def _places(points: list[dict[str, Any]], value: Value) -> tuple[list[float], list[Any]]:
+    return [p["milliseconds"] for p in points], [value(p) for p in points]
+
+
+def _note(axes: Any, text: str, x: list[float], y: list[Any], color: str) -> None:
+    place = {"xytext": (-4, -11), "textcoords": "offset points", "ha": "right"}
+    axes.annotate(text, (x[0], y[0]), fontsize=8, color=color, **place)
 
 
 def _known(axes: Any, floor: float | None) -> None:
@@ -124,18 +113,9 @@ def _known(axes: Any, floor: float | None) -> None:
 
 def _model(axes: Any, psnr: float) -> None:
     """Marks what the field would reach with perfect quadrature."""
-    axes.axhline(psnr, color="k", lw=0.9, ls=(0, (6, 3)), zorder=1)
-    axes.annotate(
-        f"perfect quadrature, model error alone: {psnr:.2f} dB",
-        (0.99, psnr),
-        (0, -14),
-        xycoords=("axes fraction", "data"),
-        textcoords="offset points",
-        fontsize=9,
-        ha="right",
-    )
-    bottom, top = axes.get_ylim()
-    axes.set_ylim(bottom, max(top, psnr) + 0.06 * (top - bottom))
+    label = f"perfect quadrature: {psnr:.2f} dB, the model error alone"
+    line = axes.axhline(psnr, color="k", lw=0.9, ls=(0, (6, 3)), zorder=1)
+    axes.legend([line], [label], loc="lower right", fontsize=9)
 
 
 def _time_axis(axes: Any, rays: int) -> None:

@@ -31,15 +31,15 @@ def choose(
         ValueError: unless just one of both limits is given.
         InputError: if no point keeps within it; the message says what the least is.
     """
-    if (milliseconds is None) == (error is None):
-        raise ValueError("expected either milliseconds or error")
     points = record["points"]
-    if milliseconds is not None:
+    if milliseconds is not None and error is None:
         within = [p for p in points if p["milliseconds"] <= milliseconds]
         if not within:
             least = min(p["milliseconds"] for p in points)
             raise InputError(f"{milliseconds:g} ms: expected at least {least:.3g} ms")
         return min(within, key=lambda p: (_color(p), p["milliseconds"]))
+    if error is None or milliseconds is not None:
+        raise ValueError("expected either milliseconds or error")
     within = [p for p in points if _color(p) <= error]
     if not within:
         raise InputError(f"error {error:g}: expected at least {min(map(_color, points)):.2g}")
