@@ -68,7 +68,7 @@ class Report:
     samples: tuple[int, ...] = _KNOBS.samples
     """Strata a ray, with each of the rules."""
     rules: tuple[Rule, ...] = _KNOBS.rules
-    """Rules of quadrature."""
+    """Rules of quadrature; cells is the same as constant without jitter."""
     splits: tuple[float, ...] = _KNOBS.splits
     """Shares of a ray's queries that the coarse network makes; fields with two networks only."""
     stops: tuple[float, ...] = _KNOBS.stops

@@ -19,7 +19,7 @@ from . import profile as step_profile
 from .curves import RECORD, training_curves
 from .speed import Knobs, sweep
 from .speed_plot import plot_speed
-from .subject import Subject, open_subject
+from .subject import Subject, open_field, open_subject
 from .view_dependence import draw_view_dependence, field_position, find_points, surface_normal
 
 Point = tuple[float, float, float]
@@ -37,6 +37,7 @@ def report(
     knobs: Knobs | None = None,
     repeats: int = 7,
     profile: bool = True,
+    values: Mapping[str, Any] | None = None,
     data: str | Path | None = None,
     on_step: Callable[[], object] | None = None,
     on_render: Callable[[int], object] | None = None,
@@ -51,6 +52,7 @@ def report(
         knobs, repeats: what :func:`mi_nerf.report.sweep` tries; without knobs, speed and error
             are left out.
         profile: measure training steps; left out, with the reason, where that is impossible.
+        values: parameters of a formula.
         data: the dataset, if it is not that of the run.
         on_step: called after every training step.
         on_render: called after every rendering of the sweep with their number in all.
@@ -65,14 +67,17 @@ def report(
             or where it is even, or ``out`` cannot be written.
     """
     check_folder(out)
-    subject = open_subject(target, variant, data=data, **rays)
-    opened = target if isinstance(target, Target) else None
-    if not isinstance(target, Target) and not subject.formula:
-        opened = open_target(target)
+    subject = open_field(target, variant, values=values)
+    seen = None
+    if knobs is not None:
+        seen = open_subject(target, variant, values=values, data=data, **rays)
+    opened = None
+    if not subject.formula:
+        opened = target if isinstance(target, Target) else open_target(target)
     places, no_places = _places(opened, subject, points, data)
     speed = None
-    if knobs is not None:
-        speed = sweep(subject, knobs, repeats=repeats, on_render=on_render)
+    if seen is not None:
+        speed = sweep(seen, knobs, repeats=repeats, on_render=on_render)
     folder = make_folder(out)
     record: dict[str, Any] = {
         "target": subject.name,

@@ -270,6 +270,11 @@ def _how_to_read(record: Record) -> list[str]:
         )
         + " Depths count where the reference is more than half opaque, in scene units.",
     ]
+    if all(p["rule"] != "cells" for p in record["points"]):
+        lines += [
+            "",
+            "Without jitter the rule `cells` is `constant`: a sample's cell is its stratum.",
+        ]
     if any(p["grid"] for p in record["points"]):
         lines += [
             "",

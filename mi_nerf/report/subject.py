@@ -124,25 +124,48 @@ def open_subject(
     for name, value in (("rays", rays), ("views", views)):
         if value < 1:
             raise InputError(f"--{name} {value}: expected at least 1")
-    backend = array_module(variant)
-    if not isinstance(target, Target) and is_formula(target):
-        field = _formula(str(target), values or {}, backend)
-        cameras = _around(field, views)
-        subject = Subject(str(target), True, field, None, MarchSettings(), backend, variant)
+    opened = _opened(target)
+    subject = open_field(opened, variant, values=values)
+    if isinstance(opened, str):
+        cameras = _around(subject.field, views)
     else:
-        opened = target if isinstance(target, Target) else open_target(target)
-        if values:
-            raise InputError(f"--set {next(iter(values))}: {opened.path} is no formula")
-        learned, occupancy = opened.contents.build(backend)
-        march = opened.contents.march
-        subject = Subject(str(opened.path), False, learned, occupancy, march, backend, variant)
-        cameras = _cameras(opened, learned, data, split, downscale, views)
+        cameras = _cameras(opened, subject.field, data, split, downscale, views)
     return _with_rays(subject, cameras, rays, seed)
 
 
-def is_formula(target: str | Path) -> bool:
-    """Whether a target names a formula and no file."""
-    return str(target) in CLOSED_FORMS and not Path(target).exists()
+def open_field(
+    target: Target | str | Path, variant: str, *, values: Mapping[str, Any] | None = None
+) -> Subject:
+    """The same without rays, whatever has become of the images.
+
+    Raises:
+        InputError: if the target is none, or has no such parameters.
+    """
+    backend = array_module(variant)
+    opened = _opened(target)
+    if isinstance(opened, str):
+        formula = _formula(opened, values or {}, backend)
+        return Subject(opened, True, formula, None, MarchSettings(), backend, variant)
+    if values:
+        raise InputError(f"--set {next(iter(values))}: {opened.path} is no formula")
+    field, occupancy = opened.contents.build(backend)
+    return Subject(
+        str(opened.path), False, field, occupancy, opened.contents.march, backend, variant
+    )
+
+
+def _opened(target: Target | str | Path) -> Target | str:
+    """A run or field file, or the name of a formula."""
+    if isinstance(target, Target):
+        return target
+    if str(target) in CLOSED_FORMS and not Path(target).exists():
+        return str(target)
+    if not Path(target).exists():
+        raise InputError(
+            f"{target}: not found, expected a run folder, a field file or one of "
+            f"{', '.join(CLOSED_FORMS)}"
+        )
+    return open_target(target)
 
 
 @dataclass(frozen=True)
