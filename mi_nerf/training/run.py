@@ -6,7 +6,8 @@ import json
 import platform
 import time
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,8 @@ class Run:
         self.folder, self.config, self.variant = folder, config, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
         self.interrupted = False  # by Ctrl-C, when last trained
-        self._started = started  # None: the clock stands still
+        self._started = started  # None: the clock stands still,
+        self._paused = time.monotonic()  # since then
         self.trainer = Trainer(config, dataset, array_module(variant))
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before the clock was last started
@@ -102,17 +104,24 @@ class Run:
             ) from error
         _cut_log(self.folder / LOG, self.trainer.step_count)
 
-    def train(self, show_bar: bool = True) -> None:
+    def train(
+        self, show_bar: bool = True, after_step: Callable[[Run], object] | None = None
+    ) -> None:
         """Trains until the budget is spent or the user interrupts; always saves.
+
+        Args:
+            after_step: called after every step; :meth:`clock_stopped` is for it.
 
         Raises:
             TrainingError: after too many non-finite steps in a row, or collapses.
         """
         with ProgressBar(self.config, self.progress, show_bar) as bar:
-            for line in self.reports():
+            for line in self.reports(after_step):
                 bar.update(self.progress, line, self.interrupted)
 
-    def reports(self) -> Iterator[dict[str, Any]]:
+    def reports(
+        self, after_step: Callable[[Run], object] | None = None
+    ) -> Iterator[dict[str, Any]]:
         """Trains as :meth:`train` does, and hands over every report on the way.
 
         A report is a line of the log: ``step``, ``seconds`` (of training), ``loss``, ``psnr``
@@ -140,15 +149,17 @@ class Run:
                 finished = self.progress >= 1 or self.interrupted
                 if now - last_report >= self.config.report_every or finished:
                     self._settle()
-                    last_report = now
+                    line, last_report = self._report(), now
                     try:
-                        yield self._paused(self._report())
+                        with self.clock_stopped():
+                            yield line
                     except GeneratorExit:  # the caller left the loop
                         break
-                    self._start_clock()
                 if now - last_save >= self.config.checkpoint_every:
                     self.save()
                     last_save = self.seconds
+                if after_step is not None:
+                    after_step(self)
             self.interrupted = bool(stop)
             self._settle()
             self.save()
@@ -214,19 +225,25 @@ class Run:
 
     # ---------------------------------- The clock ----------------------------------
 
-    def _start_clock(self) -> None:
-        if self._started is None:
-            self._started = time.monotonic()
-            self._since = Meter()
+    @contextmanager
+    def clock_stopped(self) -> Iterator[None]:
+        """What happens inside is not training time; steps under way are waited for before."""
+        dr.sync_thread()
+        self.pause()
+        try:
+            yield
+        finally:
+            self._start_clock()
 
     def pause(self) -> None:
         """Stops the clock until training goes on."""
-        self._before, self._started = self.seconds, None
+        if self._started is not None:
+            self._before, self._started, self._paused = self.seconds, None, time.monotonic()
 
-    def _paused(self, line: dict[str, Any]) -> dict[str, Any]:
-        """``line``, with the clock stopped before the caller gets it."""
-        self.pause()
-        return line
+    def _start_clock(self) -> None:
+        if self._started is None:
+            self._started = time.monotonic()
+            self._since.pause(self._started - self._paused)
 
     # ---------------------------------- One step ----------------------------------
 
