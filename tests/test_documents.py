@@ -219,12 +219,11 @@ OWN_SCENE = """<scene version="3.0.0"><emitter type="constant"/><shape type="sph
 
 
 @pytest.fixture
-def workplace(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def workplace(blob: Path, blob_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with what the examples speak of."""
     shutil.copytree(blob, tmp_path / "lego")
-    field = small_file(tmp_path)
-    (tmp_path / "runs/lego").mkdir(parents=True)
-    shutil.copy(field, tmp_path / "runs/lego/field.safetensors")
+    shutil.copytree(blob_run, tmp_path / "runs/lego")
+    small_file(tmp_path)
     (tmp_path / "scene.xml").write_text(SCENE)
     (tmp_path / "my_scene.xml").write_text(OWN_SCENE)
     monkeypatch.chdir(tmp_path)
@@ -270,6 +269,9 @@ def test_python_examples_run(text: str, workplace: Path, monkeypatch: pytest.Mon
     if "llvm_ad_rgb" not in mi_nerf.available_variants():
         pytest.skip("the examples are written for LLVM")
     monkeypatch.setattr(closed_form, "CLOSED_FORMS", dict(closed_form.CLOSED_FORMS))
+    if '"report/"' in text:
+        command = "report runs/lego --out report/ --no-profile --repeats 1 --samples 8 --rays 64"
+        assert main(command.split()) == 0
     variant = mi.variant()
     try:
         exec(compile(text, "example", "exec"), {"__name__": "__main__"})
