@@ -63,8 +63,8 @@ def test_looks_take_no_training_time_and_change_nothing(blob: Path, tmp_path: Pa
         time.sleep(0.5)
         return {}
 
-    watched = training.start(blob, tmp_path / "watched", config, VARIANT)
     start = time.monotonic()
+    watched = training.start(blob, tmp_path / "watched", config, VARIANT)
     watch = Watch(tmp_path / "watched", 3, look)
     watched.train(show_bar=False, after_step=watch)
     elapsed = time.monotonic() - start
