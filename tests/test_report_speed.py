@@ -222,6 +222,26 @@ def test_rays_are_pixels_of_the_views(blob_run: Path) -> None:
     assert (some.truth == subject.truth[:50]).all() and some.first(20).rays == 20
 
 
+def test_what_display_values_may_be_off_by(blob_run: Path) -> None:
+    """By colours and opacities at their worst; in linear fields the slope of sRGB counts."""
+    subject = open_subject(blob_run, VARIANT, views=1, rays=5)
+    rng = np.random.default_rng(0)
+    opacity = rng.random(1000)
+    color = opacity[:, None] * rng.random((1000, 3))
+    error = rng.random((1000, 4)) * 1e-2
+    for space in ("srgb", "linear"):
+        field = AnalyticField(lambda p: p[0])
+        field.color_space = space
+        seen = replace(subject, field=field)
+        bound = seen.shown_error(color, opacity, error)
+        for _ in range(20):
+            off = error * rng.uniform(-1, 1, error.shape)
+            moved = seen.shown(color + off[:, :3], opacity + off[:, 3]) - seen.shown(color, opacity)
+            assert (np.abs(moved) <= bound + 1e-12).all()
+        assert bound.max() > 0.9 * np.abs(error[:, :3] + error[:, 3:]).max()
+    assert (open_subject("slab", VARIANT, rays=5).shown_error(color, opacity, error)).max() < 1e-2
+
+
 # ---- What is said -----------------------------------------------------------------
 
 

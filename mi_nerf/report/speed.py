@@ -139,11 +139,7 @@ def sweep(
         {"knobs": names, **_description(s), **_timing(times[s]), **_errors(subject, seen[s], exact)}
         for s, names in settings.items()
     ]
-    floor = record["error"]["color"]
-    errors = [float(f"{max(p['error']['color'], floor):.1e}") for p in points]
-    marks = pareto_front([p["milliseconds"] for p in points], errors)
-    for point, mark in zip(points, marks, strict=True):
-        point["pareto"] = mark
+    _mark_front(points, record["error"]["color"])
     return {
         "field": subject.name,
         "formula": subject.formula,
@@ -238,6 +234,14 @@ def _errors(subject: Subject, seen: Seen, exact: Reference) -> dict[str, Any]:
     }
 
 
+def _mark_front(points: list[dict[str, Any]], floor: float) -> None:
+    """Marks the Pareto front; what lies below ``floor`` counts as equal."""
+    errors = [float(f"{max(p['error']['color'], floor):.1e}") for p in points]
+    marks = pareto_front([p["milliseconds"] for p in points], errors)
+    for point, mark in zip(points, marks, strict=True):
+        point["pareto"] = mark
+
+
 def _rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
@@ -277,7 +281,7 @@ def _reference(subject: Subject, seconds: float) -> tuple[Reference, dict[str, A
         "max_intervals": most,
         "seconds": elapsed,
         "error": {
-            "color": _rms(exact.error[:, :3]),
+            "color": _rms(subject.shown_error(exact.color, exact.opacity, exact.error)),
             "opacity": _rms(exact.error[:, 3]),
             "depth": _rms(exact.error[there, 4]) if there.any() else None,
         },
