@@ -262,6 +262,7 @@ def a_record(*points: dict[str, Any], psnr: float | None = None) -> dict[str, An
         "views": {"data": None, "views": 2, "size": [10, 10], "seed": 0},
         "machine": {"gpu": None, "cores": 2, "processor": "abacus", "variant": "llvm_ad_rgb"},
         "own_grid": None,
+        "by": "depth" if psnr is None else "color",
         "reference": {
             "psnr": psnr,
             "max_intervals": 512,
@@ -289,8 +290,11 @@ def test_conclusions_about_formulas() -> None:
     other = point(64, 12, 1e-4, None, rule="linear")
     other["error"]["depth"] = 3e-4
     text = "\n".join(conclusions(a_record(own, point(128, 20, 2.5e-5, None), other)))
-    assert "`linear` has 3.00 to 3.00 times the error of `constant` (depth)" in text
-    assert "The fastest with an error below 0.001: 64 samples" in text and "dB" not in text
+    assert "`linear` has 3.00 to 3.00 times the error of `constant` (by the depth)" in text
+    assert (
+        "The fastest with an error of the depth below 0.001: 64 samples" in text
+        and "dB" not in text
+    )
 
 
 def test_choosing_for_a_budget() -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..machine import machine_line
+from .speed_text import WORDS
 
 Record = dict[str, Any]
 Value = Callable[[dict[str, Any]], float | None]
@@ -79,7 +80,7 @@ def _panel(axes: Any, record: Record, value: Value, *, named: bool = True) -> No
     axes.plot(*_places(own, value), "*", color="k", ms=13, zorder=5, ls="", label="own settings")
     front = [p for p in points if p["pareto"]]
     rings: dict[str, Any] = {"mfc": "none", "mec": "k", "ms": 12, "ls": ""}
-    label = "Pareto front: no other as fast and exact"
+    label = f"Pareto front by {WORDS[record['by']]}: no other as fast and exact"
     axes.plot(*_places(front, value), "o", label=label, **rings)
 
 
