@@ -100,15 +100,16 @@ def _known(axes: Any, floor: float | None) -> None:
     if floor is None or floor <= bottom:
         return
     axes.axhspan(bottom, floor, color="#eeeeee", zorder=0)
-    axes.annotate(
-        "below what the reference states as its own error",
-        (0.01, floor),
-        (0, -11),
-        xycoords=("axes fraction", "data"),
-        textcoords="offset points",
-        fontsize=8,
-        color="#666666",
-    )
+    if floor > 2 * bottom:  # else there is no room for words
+        axes.annotate(
+            "below what the reference states as its own error",
+            (0.01, floor),
+            (0, -11),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            fontsize=8,
+            color="#666666",
+        )
     axes.set_ylim(bottom, top)
 
 
