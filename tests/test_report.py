@@ -173,7 +173,7 @@ def test_a_run_whose_data_is_gone(
     config["data"]["path"] = str(gone)
     (run / "config.json").write_text(json.dumps(config))
     out = tmp_path / "out"
-    assert f"{gone}: the dataset of {run} is gone" in refused("report", run, "--out", out)
+    assert f"{gone}: no such dataset folder" in refused("report", run, "--out", out)
     assert main(["report", str(run), "--out", str(out), "--no-speed"]) == 0
     reason = f"{gone}: no such dataset folder"
     assert f"no profile of training steps: {reason}" in capsys.readouterr().out

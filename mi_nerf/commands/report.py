@@ -116,7 +116,7 @@ class Report:
                 raise InputError(f"--{option}: of trainings, expected --train DATA, no TARGET")
         knobs = self._knobs() if self.speed else None
         with (
-            progress_bar("report", "rendering") as renderings,
+            progress_bar("reference", "rendering") as renderings,
             progress_bar("profile", "training step") as steps,
         ):
             record = report(
@@ -190,6 +190,7 @@ class Report:
 
 def _advance(bar: tqdm[Any], total: int) -> None:
     bar.total = total
+    bar.set_description("report", refresh=False)
     bar.update()
 
 

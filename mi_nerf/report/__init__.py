@@ -15,11 +15,13 @@ Quality against seconds of training::
     rows = rows_of(["nerf", "fast"], {"network.width": ["32", "64"]}, ["max_seconds=30"])
     record = training_curves("lego/", "out/", rows, variant, seeds=2)
     plot_curves(record)
+    training_conclusions(record)
 
 ``load("report/")`` reads what ``mi-nerf report`` has written.
 """
 
 from .curves import rows_of, training_curves
+from .curves_text import conclusions as training_conclusions
 from .curves_text import plot_curves
 from .pareto import pareto_front
 from .run import load, report, report_training
@@ -43,5 +45,6 @@ __all__ = [
     "report_training",
     "rows_of",
     "sweep",
+    "training_conclusions",
     "training_curves",
 ]

@@ -115,8 +115,10 @@ def sweep(
         mean square against the reference: ``color``, ``opacity``, and ``depth`` in scene
         units where the reference is more than half opaque), ``psnr`` (against the images, or
         ``None``) and ``pareto`` (no other point is as fast and as exact, and better in one;
-        errors count in two digits, and no less than the reference states of itself).
-        ``reference`` has the ``psnr`` of the reference and the ``error`` that it states.
+        errors count in two digits, and no less than the reference states of itself). ``by``
+        names the error that counts: that of the colour; of formulas, in which colour tells of
+        the optical depth alone, that of the depth. ``reference`` has the ``psnr`` of the
+        reference and the ``error`` that it states.
     """
     settings = settings_of(subject, knobs or Knobs())
     total = (repeats + 1) * len(settings)
@@ -139,15 +141,13 @@ def sweep(
         {"knobs": names, **_description(s), **_timing(times[s]), **_errors(subject, seen[s], exact)}
         for s, names in settings.items()
     ]
-    floor = record["error"]["color"]
-    errors = [float(f"{max(p['error']['color'], floor):.1e}") for p in points]
-    marks = pareto_front([p["milliseconds"] for p in points], errors)
-    for point, mark in zip(points, marks, strict=True):
-        point["pareto"] = mark
+    by = "depth" if subject.formula and record["error"]["depth"] is not None else "color"
+    _mark_front(points, by, record["error"][by])
     return {
         "field": subject.name,
         "formula": subject.formula,
         "unit": subject.unit,
+        "by": by,
         "rays": subject.rays,
         "views": dict(subject.views),
         "repeats": repeats,
@@ -238,6 +238,14 @@ def _errors(subject: Subject, seen: Seen, exact: Reference) -> dict[str, Any]:
     }
 
 
+def _mark_front(points: list[dict[str, Any]], by: str, floor: float) -> None:
+    """Marks the Pareto front; errors below ``floor`` count as equal."""
+    errors = [float(f"{max(p['error'][by], floor):.1e}") for p in points]
+    marks = pareto_front([p["milliseconds"] for p in points], errors)
+    for point, mark in zip(points, marks, strict=True):
+        point["pareto"] = mark
+
+
 def _rms(x: Array) -> float:
     return float(np.sqrt(np.mean(np.square(x))))
 
@@ -277,7 +285,7 @@ def _reference(subject: Subject, seconds: float) -> tuple[Reference, dict[str, A
         "max_intervals": most,
         "seconds": elapsed,
         "error": {
-            "color": _rms(exact.error[:, :3]),
+            "color": _rms(subject.shown_error(exact.color, exact.opacity, exact.error)),
             "opacity": _rms(exact.error[:, 3]),
             "depth": _rms(exact.error[there, 4]) if there.any() else None,
         },

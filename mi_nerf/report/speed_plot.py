@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..machine import machine_line
+from .speed_text import WORDS
 
 Record = dict[str, Any]
 Value = Callable[[dict[str, Any]], float | None]
@@ -79,7 +80,7 @@ def _panel(axes: Any, record: Record, value: Value, *, named: bool = True) -> No
     axes.plot(*_places(own, value), "*", color="k", ms=13, zorder=5, ls="", label="own settings")
     front = [p for p in points if p["pareto"]]
     rings: dict[str, Any] = {"mfc": "none", "mec": "k", "ms": 12, "ls": ""}
-    label = "Pareto front: no other as fast and exact"
+    label = f"Pareto front by {WORDS[record['by']]}: no other as fast and exact"
     axes.plot(*_places(front, value), "o", label=label, **rings)
 
 
@@ -99,15 +100,16 @@ def _known(axes: Any, floor: float | None) -> None:
     if floor is None or floor <= bottom:
         return
     axes.axhspan(bottom, floor, color="#eeeeee", zorder=0)
-    axes.annotate(
-        "below what the reference states as its own error",
-        (0.01, floor),
-        (0, -11),
-        xycoords=("axes fraction", "data"),
-        textcoords="offset points",
-        fontsize=8,
-        color="#666666",
-    )
+    if floor > 2 * bottom:  # else there is no room for words
+        axes.annotate(
+            "below what the reference states as its own error",
+            (0.01, floor),
+            (0, -11),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            fontsize=8,
+            color="#666666",
+        )
     axes.set_ylim(bottom, top)
 
 

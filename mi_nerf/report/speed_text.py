@@ -14,6 +14,7 @@ Point = dict[str, Any]
 
 _NOTHING = 0.05  # dB that nobody sees
 _BUDGET = 0.1  # dB, and for formulas a share of the largest radiance: what may be given up
+WORDS = {"color": "colour", "depth": "depth"}
 _FINE = 1e-3  # a quarter of an 8-bit step
 
 
@@ -25,7 +26,7 @@ def choose(
     Args:
         record: of :func:`mi_nerf.report.sweep`.
         milliseconds: for all ``record["rays"]`` rays.
-        error: root mean square quadrature error of the colour.
+        error: root mean square quadrature error, of what ``record["by"]`` says.
 
     Raises:
         ValueError: unless just one of both limits is given.
@@ -37,12 +38,13 @@ def choose(
         if not within:
             least = min(p["milliseconds"] for p in points)
             raise InputError(f"{milliseconds:g} ms: expected at least {least:.3g} ms")
-        return min(within, key=lambda p: (_color(p), p["milliseconds"]))
+        return min(within, key=lambda p: (_error(record, p), p["milliseconds"]))
     if error is None or milliseconds is not None:
         raise ValueError("expected either milliseconds or error")
-    within = [p for p in points if _color(p) <= error]
+    within = [p for p in points if _error(record, p) <= error]
     if not within:
-        raise InputError(f"error {error:g}: expected at least {min(map(_color, points)):.2g}")
+        least = min(_error(record, p) for p in points)
+        raise InputError(f"error {error:g}: expected at least {least:.2g}")
     return min(within, key=lambda p: p["milliseconds"])
 
 
@@ -81,6 +83,11 @@ def conclusions(record: Record) -> list[str]:
     return [*result, *_more_and_fewer(record), *_fastest(record), *_rules(record)]
 
 
+def _error(record: Record, point: Point) -> float:
+    """The error that counts."""
+    return float(point["error"][record["by"]])
+
+
 def _color(point: Point) -> float:
     return float(point["error"]["color"])
 
@@ -112,15 +119,15 @@ def _more_and_fewer(record: Record) -> list[str]:
             f"{most['milliseconds'] / own['milliseconds']:.1f} times as long for "
             f"{most['psnr']:.2f} dB."
         )
-    floor = record["reference"]["error"]["color"]
-    known = [p for p in line if _color(p) > floor]
+    known = [p for p in line if _error(record, p) > record["reference"]["error"][record["by"]]]
     if len(known) > 1:
         first, last = known[0], known[-1]
-        fall = math.log(_color(first) / _color(last))
+        before, after = (_error(record, p) for p in (first, last))
+        order = math.log(before / after) / math.log(last["samples"] / first["samples"])
         result.append(
-            f"From {first['samples']} to {last['samples']} samples the error falls from "
-            f"{_color(first):.1e} to {_color(last):.1e}, as samples to the power of "
-            f"{-fall / math.log(last['samples'] / first['samples']):.1f}; the time grows from "
+            f"From {first['samples']} to {last['samples']} samples the error of the "
+            f"{WORDS[record['by']]} falls from {before:.1e} to {after:.1e}, as samples to the "
+            f"power of {-order:.1f}; the time grows from "
             f"{first['milliseconds']:.3g} to {last['milliseconds']:.3g} ms."
         )
     return result
@@ -128,13 +135,13 @@ def _more_and_fewer(record: Record) -> list[str]:
 
 def _fastest(record: Record) -> list[str]:
     """The fastest point that gives up next to nothing."""
-    best = record["reference"]["psnr"]
+    best, word = record["reference"]["psnr"], WORDS[record["by"]]
     if best is None:
         try:
             point = choose(record, error=_FINE)
         except InputError:
-            return [f"No setting has an error below {_FINE:g}."]
-        what = f"with an error below {_FINE:g}"
+            return [f"No setting has an error of the {word} below {_FINE:g}."]
+        what = f"with an error of the {word} below {_FINE:g}"
     else:
         good = [p for p in record["points"] if (p["psnr"] or 0) >= best - _BUDGET]
         if not good:
@@ -146,27 +153,27 @@ def _fastest(record: Record) -> list[str]:
 
 def _rules(record: Record) -> list[str]:
     """Other rules against the own one, at equal samples."""
-    own = record["points"][0]["rule"]
+    own, word = record["points"][0]["rule"], WORDS[record["by"]]
     line = {p["samples"]: p for p in _of_samples(record, own)}
     names = {p["rule"] for p in record["points"]} - {own}
     result = []
-    quantity = "depth" if record["formula"] else "color"  # of formulas, colours are all alike
     for rule in sorted(names):
         pairs = [
-            (p["error"][quantity], line[p["samples"]]["error"][quantity])
+            (_error(record, p), _error(record, line[p["samples"]]))
             for p in _of_samples(record, rule)
             if p["samples"] in line
         ]
         ratios = [a / b for a, b in pairs if a and b]
         if not ratios:
             continue
-        word = {"color": "colour"}.get(quantity, quantity)
         if max(abs(r - 1) for r in ratios) < 0.02:
-            result.append(f"`{rule}` is the same as `{own}` here.")
+            result.append(
+                f"At equal samples `{rule}` and `{own}` err alike (by the {word}, within 2 %)."
+            )
         else:
             result.append(
                 f"At equal samples `{rule}` has {min(ratios):.2f} to {max(ratios):.2f} times the "
-                f"error of `{own}` ({word})."
+                f"error of `{own}` (by the {word})."
             )
     return result
 
@@ -192,8 +199,8 @@ def markdown(record: Record, figure: str) -> list[str]:
         f"{record['rays']:,} rays {_origin(record)}, seed {record['views']['seed']}; "
         f"{machine_line(record['machine'])}. Times are of all these rays, the median of "
         f"{record['repeats']} renderings after a first one that compiled, with the fastest and "
-        "slowest in brackets. **Bold**: on the Pareto front, no other setting is as fast and as "
-        "exact.",
+        f"slowest in brackets. **Bold**: on the Pareto front, no other setting is as fast and as "
+        f"exact, by the error of the {WORDS[record['by']]}.",
     ]
     for knob, title in _TITLES.items():
         points = _sorted_points(record, knob)

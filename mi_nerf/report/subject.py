@@ -73,6 +73,16 @@ class Subject:
         image = color + (1 - opacity[:, None])
         return np.clip(linear_to_srgb(image) if self.field.color_space == "linear" else image, 0, 1)
 
+    def shown_error(self, color: Array, opacity: Array, error: Array) -> Array:
+        """(R, 3): what :meth:`shown` may be off by, if colours and opacities are by (R, 4)."""
+        if self.formula:
+            return error[:, :3]
+        off = error[:, :3] + error[:, 3:4]  # the background shows through by the opacity
+        here = self.shown(color, opacity)
+        ends = (self.shown(color + sign * off, opacity) for sign in (-1, 1))
+        result: Array = np.maximum(*(np.abs(end - here) for end in ends))
+        return result
+
     def psnr(self, shown: Array) -> float | None:
         """PSNR in dB of all R pixels together, in 8 bits, against the images, if there are any."""
         if self.truth is None:
