@@ -14,7 +14,7 @@ import numpy as np
 from .backend import array_module
 from .cameras import Intrinsics
 from .color import srgb_to_linear
-from .data import Dataset, available_splits, load_dataset
+from .data import Dataset, held_out_split, load_dataset
 from .errors import InputError
 from .files import check_file, check_folder, make_folder, replacing
 from .images import on_white, write_picture
@@ -201,10 +201,9 @@ def _cameras(target: Target, path: Path_) -> Dataset:
     assert target.data is not None
     if path != "test":
         return load_dataset(target.data, "train", downscale=target.downscale)
-    splits = [s for s in available_splits(target.data) if s != "train"]
-    if not splits:
+    split = held_out_split(target.data)
+    if split is None:
         raise InputError(f"{target.data}: has no test views, expected --path orbit or spiral")
-    split = "test" if "test" in splits else splits[0]
     return load_dataset(target.data, split, downscale=target.downscale)
 
 

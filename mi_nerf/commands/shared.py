@@ -23,11 +23,11 @@ def positive(name: str, value: Any) -> Any:
     return value
 
 
-def name_and_value(text: str) -> tuple[str, str]:
-    """The two sides of ``name=value``, as ``--set`` takes it; InputError if it is none."""
+def name_and_value(text: str, option: str = "--set") -> tuple[str, str]:
+    """The two sides of ``name=value``, as ``option`` takes it; InputError if it is none."""
     name, equals, value = text.partition("=")
     if not (name and equals):
-        raise InputError(f"--set {text}: expected name=value")
+        raise InputError(f"{option} {text}: expected name=value")
     return name, value
 
 

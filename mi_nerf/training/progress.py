@@ -29,6 +29,10 @@ class Meter:
         self._rays += int(result.rays[0])
         self._queries += result.queries
 
+    def pause(self, seconds: float) -> None:
+        """Leaves out time that has passed without training."""
+        self._start += seconds
+
     def summary(self) -> dict[str, Any]:
         elapsed = max(time.monotonic() - self._start, 1e-9)
         mse = float(np.mean(self._errors)) if self._errors else math.nan

@@ -6,7 +6,8 @@ import json
 import platform
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -103,8 +104,25 @@ class Run:
             ) from error
         _cut_log(self.folder / LOG, self.trainer.step_count)
 
-    def train(self, show_bar: bool = True) -> None:
+    @contextmanager
+    def clock_stopped(self) -> Iterator[None]:
+        """What happens inside is not training time; steps under way are waited for before."""
+        dr.sync_thread()
+        start = time.monotonic()
+        try:
+            yield
+        finally:
+            pause = time.monotonic() - start
+            self._started += pause
+            self._since.pause(pause)
+
+    def train(
+        self, show_bar: bool = True, after_step: Callable[[Run], object] | None = None
+    ) -> None:
         """Trains until the budget is spent or the user interrupts; always saves.
+
+        Args:
+            after_step: called after every step; :meth:`clock_stopped` is for it.
 
         Raises:
             TrainingError: after too many non-finite steps in a row, or collapses.
@@ -127,6 +145,8 @@ class Run:
                 if now - last_save >= self.config.checkpoint_every:
                     self.save()
                     last_save = self.seconds
+                if after_step is not None:
+                    after_step(self)
             self._settle()
             self.save()
 
