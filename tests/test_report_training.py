@@ -176,8 +176,8 @@ def test_what_curves_say() -> None:
     assert seconds_to(fast["curve"], 5) == 1 and seconds_to(fast["curve"], 22) is None
     slow = summary("nerf", [{"curve": curve((2, 9), (4, 16)), **ending}])
     text = "\n".join(conclusions({"rows": [slow, fast]}))
-    assert "`fast` with 21.00 dB (2 seeds, 20.00 to 22.00)" in text
-    assert "5.00 dB more than `nerf` has" in text and "it passes that of `nerf` by 2 s" in text
+    assert "21.00 dB after 4 s (2 seeds, 20.00 to 22.00)" in text
+    assert "It ends 5.00 dB above `nerf` (16.00 dB after 4 s), and passes that after 2 s." in text
     assert "1 runs failed" in text
 
 

@@ -17,19 +17,19 @@ def conclusions(record: Record) -> list[str]:
     if not rows:
         return ["No run has come to an end."]
     first, *others = rows
-    values = [run["curve"][-1]["psnr"] for run in first["runs"] if not run["failed"]]
+    values = _endings(first)
     spread = f", {min(values):.2f} to {max(values):.2f}" if len(values) > 1 else ""
     count = f"{len(values)} seed{'s' if len(values) > 1 else ''}"
     result = [
-        f"The best after its {first['seconds']:.0f} s is `{first['name']}` with "
-        f"{first['psnr']:.2f} dB ({count}{spread})."
+        f"`{first['name']}` comes to the best end: {first['psnr']:.2f} dB after "
+        f"{first['seconds']:.0f} s ({count}{spread})."
     ]
     for other in others:
         passed = seconds_to(first["curve"], other["psnr"])
-        when = "" if passed is None else f"; it passes that of `{other['name']}` by {passed:.0f} s"
+        when = "" if passed is None else f", and passes that after {passed:.0f} s"
         result.append(
-            f"That is {first['psnr'] - other['psnr']:.2f} dB more than `{other['name']}` has "
-            f"after its {other['seconds']:.0f} s ({other['psnr']:.2f} dB){when}."
+            f"It ends {first['psnr'] - other['psnr']:.2f} dB above `{other['name']}` "
+            f"({other['psnr']:.2f} dB after {other['seconds']:.0f} s){when}."
         )
     for row in rows:
         if len(row["curve"]) > 1:
@@ -89,9 +89,8 @@ def _table(record: Record) -> list[str]:
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in record["rows"]:
-        good = [run for run in row["runs"] if run["failed"] is None]
-        values = [run["curve"][-1]["psnr"] for run in good if run["curve"]]
-        steps = [run["steps"] for run in good]
+        values = _endings(row)
+        steps = [run["steps"] for run in row["runs"] if run["failed"] is None]
         cells = [
             f"`{row['name']}`",
             _text(row["psnr"], ".2f"),
@@ -107,6 +106,14 @@ def _table(record: Record) -> list[str]:
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
+
+
+def _endings(row: Record) -> list[float]:
+    """The PSNR of every seed at the end, where it is a number."""
+    last = [
+        run["curve"][-1]["psnr"] for run in row["runs"] if run["failed"] is None and run["curve"]
+    ]
+    return [value for value in last if value is not None]
 
 
 def _text(value: float | None, form: str) -> str:

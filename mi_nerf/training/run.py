@@ -26,7 +26,7 @@ from ..files import check_folder, make_folder, read_json, write_json
 from ..interrupts import interruptible
 from ..views import Image, View, display_image, render_view
 from ..volume import MarchSettings
-from .auto import Decision, choose
+from .auto import Choice, Decision, choose
 from .checkpoint import load_checkpoint, save_checkpoint
 from .config import TrainConfig, from_json, to_json
 from .progress import Meter, ProgressBar
@@ -56,20 +56,26 @@ class Run:
         variant: str,
         *,
         started: float | None = None,
+        trainer: Trainer | None = None,
     ) -> None:
-        """``started``: the value of ``time.monotonic()`` from which seconds count; none: they
-        count while :meth:`reports` is at work."""
+        """
+        Args:
+            started: the value of ``time.monotonic()`` from which seconds count; none: they
+                count while :meth:`reports` is at work.
+            trainer: of this configuration and dataset, to go on with if it has begun.
+        """
         self.folder, self.config, self.variant = folder, config, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
         self.interrupted = False  # by Ctrl-C, when last trained
         self._started = started  # None: the clock stands still,
         self._paused = time.monotonic()  # since then
-        self.trainer = Trainer(config, dataset, array_module(variant))
+        self.trainer = trainer or Trainer(config, dataset, array_module(variant))
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before the clock was last started
         self._skipped = 0
         self._skipped_in_row = 0
         self._attempt_start = 0
+        self._begun = self.trainer.step_count  # before the log began
         self._since = Meter()
         # Squared errors of the last steps, as many as tell a collapse from bad luck.
         self._recent: deque[float] = deque(maxlen=max(1, min(100, config.collapse_check // 2)))
@@ -98,6 +104,7 @@ class Run:
             self._before = float(state["seconds"])
             self._skipped = int(state["skipped"])
             self._attempt_start = int(state["attempt_start"])
+            self._begun = int(state.get("begun", 0))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{self.folder / CHECKPOINT}: damaged description of the progress: {error}"
@@ -195,6 +202,7 @@ class Run:
             "seconds": self.seconds,
             "skipped": self._skipped,
             "attempt_start": self._attempt_start,
+            "begun": self._begun,
         }
         save_checkpoint(self.folder / CHECKPOINT, self.trainer, progress)
         save_field(self.folder / FIELD, self.field_file())
@@ -283,7 +291,9 @@ class Run:
     def _collapsed(self) -> bool:
         """Whether the field is still no better than empty space when it should be."""
         age = self.trainer.step_count - self._attempt_start
-        if age != self.config.collapse_check or not self._recent:
+        first = self._begun if self._attempt_start == 0 else 0
+        due = max(self.config.collapse_check, first + (self._recent.maxlen or 0))
+        if age != due or not self._recent or self.config.collapse_check == 0:
             return False
         return float(np.mean(self._recent)) > 0.9 * self._blank
 
@@ -354,11 +364,11 @@ def start(
         raise InputError(f"{folder}: already holds a run, expected --resume or another folder")
     check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
-    decisions: list[Decision] = []
+    choice = Choice(config, [])
     if config.preset == "auto" and not recorded:
-        config, decisions = choose(config, dataset, array_module(variant), given=given)
-    run = Run(folder, config, dataset, variant, started=clock)
-    run.decisions = decisions
+        choice = choose(config, dataset, array_module(variant), given=given)
+    run = Run(folder, choice.config, dataset, variant, started=clock, trainer=choice.trainer)
+    run.decisions = choice.decisions
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
         run.resume()
