@@ -28,7 +28,7 @@ class NerfIntegrator(FieldIntegrator):
 
     .. pluginparameters::
 
-     * - (nested plugin)
+     * - (Nested plugin)
        - |integrator|
        - What shows surfaces and lights, such as :monosp:`path` or :monosp:`prb`: any integrator
          that returns the radiance along a ray. Without one, the scene's surfaces are left out,

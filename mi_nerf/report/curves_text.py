@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 from ..machine import machine_line
@@ -157,8 +158,8 @@ def plot_curves(record: Record) -> Any:
     axes.set_ylabel(f"PSNR of {settings['views']} held-out views (dB)")
     axes.legend(fontsize=9)
     axes.set_title(
-        f"{settings['data']}: quality against time of training. Lines: mean of the seeds, bands: "
-        f"worst to best.\n{machine_line(record['machine'])}",
+        f"{Path(settings['data']).name}: quality against time of training. Lines: mean of the "
+        f"seeds, bands: worst to best.\n{machine_line(record['machine'])}",
         fontsize=9,
     )
     return figure
