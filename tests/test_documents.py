@@ -269,6 +269,8 @@ def test_python_examples_run(text: str, workplace: Path, monkeypatch: pytest.Mon
     if '"report/"' in text:
         command = "report runs/lego --out report/ --no-profile --repeats 1 --samples 8 --rays 64"
         assert main(command.split()) == 0
+    # A slow machine may take its time.
+    text = text.replace("milliseconds=20", "milliseconds=1e6").replace("rays=4096", "rays=64")
     variant = mi.variant()
     try:
         exec(compile(text, "example", "exec"), {"__name__": "__main__"})
