@@ -1,4 +1,4 @@
-"""Writes the tables of settings.md from the source of the settings: ``python docs/settings.py``."""
+"""Writes the tables of docs/settings.md from the settings: ``python -m tests.settings_page``."""
 
 from __future__ import annotations
 
@@ -6,20 +6,17 @@ import ast
 import dataclasses
 import inspect
 import io
-import sys
 import tokenize
 import typing
 from pathlib import Path
 from typing import Any, Literal
 
-sys.path.insert(0, str(Path(__file__).parent.parent))
+from mi_nerf.training.config import TrainConfig, to_json
+from mi_nerf.training.plain import as_text
+from mi_nerf.training.presets import PRESETS
 
-from mi_nerf.training.config import TrainConfig, to_json  # noqa: E402
-from mi_nerf.training.plain import as_text  # noqa: E402
-from mi_nerf.training.presets import PRESETS  # noqa: E402
-
-PAGE = Path(__file__).parent / "settings.md"
-MARK = "<!-- From here on written by docs/settings.py -->\n"
+PAGE = Path(__file__).parent.parent / "docs" / "settings.md"
+MARK = "<!-- From here on written by tests/settings_page.py -->\n"
 
 
 def main() -> None:
