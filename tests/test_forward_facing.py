@@ -311,8 +311,8 @@ def test_report_of_a_capture(
         next(p for p in speed["points"] if (p["samples"], p["rule"]) == (n, "constant"))
         for n in (8, 128)
     )
-    assert 0.01 < fine["error"]["depth"] < rough["error"]["depth"] < 10
-    assert fine["error"]["color"] < 0.5 * rough["error"]["color"]
+    for name in ("color", "depth"):  # second order: 256 times
+        assert 0 < fine["error"][name] < 0.1 * rough["error"][name]
     assert "expected --data" in refused(
         "report", forward_run / "field.safetensors", "--out", tmp_path / "none"
     )
