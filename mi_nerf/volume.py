@@ -288,9 +288,7 @@ class Evaluation:
         self._fused = fused(emission) if fused is not None and not keep else None
         self._emits = emission
         float_type = type(samples.t)
-        self._channels = [
-            dr.zeros(float_type, len(samples.t)) for _ in range(4 if emission else 1)
-        ]
+        self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4 if emission else 1)]
         dr.make_opaque(self._channels)  # without queries they would stay constants
         if stop <= 0:
             self.asked = samples.index

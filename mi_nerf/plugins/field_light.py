@@ -49,7 +49,9 @@ class FieldLight:
         """
         box = dr.fmin(mi.UInt32(which * self.boxes), self.boxes - 1)
         x, y, z, corner = (
-            mi.Vector3f(*(dr.gather(mi.Float, self._points, 12 * box + 3 * j + i) for i in range(3)))
+            mi.Vector3f(
+                *(dr.gather(mi.Float, self._points, 12 * box + 3 * j + i) for i in range(3))
+            )
             for j in range(4)
         )
         target = corner + where.x * x + where.y * y + where.z * z

@@ -13,20 +13,18 @@ from .paths import PathsBehind, PathSettings
 from .placement import find_fields
 from .stage import Stage
 
-_UNLIMITED = 2**31 - 1
-
 
 class NerfPathIntegrator(MarchingIntegrator):
-    r"""
-    """
+    r""" """
 
     plugin = "nerf_path"
     rays_per_pass = 1 << 20  # paths remember more than rays do
 
     def __init__(self, props: mi.Properties) -> None:
+        # Checked before the base class reads and refuses them.
+        self._integer(props, "max_depth", -1, least=0)
+        self._integer(props, "rr_depth", 5, least=1)
         super().__init__(props)
-        self.max_depth = self._integer(props, "max_depth", -1, least=0)
-        self.rr_depth = self._integer(props, "rr_depth", 5, least=1)
         self.sample_fields = bool(props.get("sample_fields", True))
         self._solid = SolidScene()
 
@@ -53,10 +51,10 @@ class NerfPathIntegrator(MarchingIntegrator):
         found = find_fields(scene, least=0)
         if not found:
             check_no_loose_field(scene)
-        fields = self._marched(found) if self.max_depth else []
+        fields = self._marched(found) if self.max_depth > 0 else []
         normals = self._wants_normals(fields)
         settings = PathSettings(
-            max_depth=_UNLIMITED if self.max_depth < 0 else self.max_depth,
+            max_depth=self.max_depth,
             rr_depth=self.rr_depth,
             paths=self.paths,
             hide_lights=not self.show_background,

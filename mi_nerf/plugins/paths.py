@@ -15,7 +15,6 @@ from .crossing import Marched, Rays
 from .field_light import FieldLight
 from .segments import see, transmittance
 
-
 _MOST_SURVIVE = 0.95  # of a wavefront in Russian roulette, as in Mitsuba's path tracer
 
 
@@ -272,7 +271,7 @@ class PathsBehind(Backdrop):
     ) -> _Connections:
         """Towards light sources: what they would bring if no field were between."""
         ds, weight = self._scene.sample_emitter_direction(si, chance.emitter, True, active)
-        active &= ds.pdf != 0
+        active = active & (ds.pdf != 0)
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
         weight *= dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
         light = dr.select(active, paths.throughput * value * weight, 0)
@@ -288,7 +287,7 @@ class PathsBehind(Backdrop):
             return None
         d = self._light.sample(si.p, chance.field, chance.field_point)
         density = self._light.pdf(si.p, d)
-        active &= density > 0
+        active = active & (density > 0)
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(d), active)
         weight = mis_weight(density, pdf) / dr.select(active, density, 1)
         light = dr.select(active, paths.throughput * value * weight, 0)
