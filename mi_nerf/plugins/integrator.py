@@ -88,8 +88,8 @@ class NerfIntegrator(MarchingIntegrator):
     integrated once (:py:mod:`mi_nerf.merging`). The integral ends exactly at the first
     surface, and the nested integrator's radiance of the ray, weakened by the fields before it,
     is added. The nested integrator does not know the fields: it sees the scene without their
-    cubes, so fields cast no shadows and are missing in mirrors. What is seen through a surface
-    that is not opaque is likewise without fields.
+    cubes, so fields cast no shadows and are missing in mirrors; :monosp:`nerf_path` has both. What
+    is seen through a surface that is not opaque is likewise without fields.
 
     The alpha channel of an RGBA film is the opacity of the fields; with a nested integrator,
     its alpha channel with the fields in front. The colour of a field trained on sRGB images is

@@ -15,7 +15,76 @@ from .stage import Stage
 
 
 class NerfPathIntegrator(MarchingIntegrator):
-    r""" """
+    r"""
+    .. _integrator-nerf_path:
+
+    Path tracer through radiance fields (:monosp:`nerf_path`)
+    ---------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Segments of the longest path, as in :monosp:`path`: 1 shows only what emits, fields
+         included; 2 adds what surfaces reflect of that; −1 sets no limit. Fields add nothing
+         to the depth. (Default: −1)
+     * - rr_depth
+       - |int|
+       - Surfaces on a path from which on it may end at random, with a probability that follows
+         from its throughput (Russian roulette). (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide lights and environment from cameras; fields are seen. (Default: false)
+     * - sample_fields
+       - |bool|
+       - At matt and glossy surfaces, sample directions towards the fields besides those that
+         the surface prefers and those of the scene's lights. Worth its time where fields
+         light up their surroundings; where they hardly do, ``false`` saves it. The mean is the
+         same. (Default: true)
+     * - paths
+       - |int|
+       - Paths that go on behind the fields for every camera ray. (Default: 1)
+     * - samples, near, far, rule, stop, jitter, aovs
+       - |int|, |float|, |string|, |bool|
+       - As in :monosp:`nerf`. ``near`` and ``far``, and those of field files, are distances
+         along camera rays and do not bound other segments. A path ends where fields let less
+         than ``stop`` of it pass. ``aovs`` are those of camera rays. (Default: as there)
+
+    Follows light paths among surfaces and lights, each segment of which passes the fields: they
+    weaken it and add what they emit. So fields cast shadows, are seen in mirrors and through
+    glass, and light up what stands around them; they do not scatter, so nothing lights *them*
+    up: what they show is what they were trained to show. The cubes of fields are no surfaces.
+    A scene without fields looks as :monosp:`path` shows it.
+
+    Light sources are sampled as in :monosp:`path`, and the light that arrives is weakened by the
+    fields between; only their densities are asked for that. Light from fields is found in two
+    ways, combined by multiple importance sampling (Veach and Guibas 1995): by the directions that
+    the surface's BSDF prefers, and by directions towards points spread evenly in the box around
+    the occupied cells of a field (:py:mod:`mi_nerf.plugins.field_light`). Fields in normalised
+    device coordinates have no such box: only the first of these finds them.
+
+    The estimate is without bias apart from the quadrature along each segment, which is that of
+    :monosp:`nerf`. All light is linear: on every segment, a field trained on sRGB images is
+    composited in sRGB as it was in training and then decoded. With C its colour and A its opacity
+    there, it adds A·srgb_to_linear(C/A) and lets pass 1 − A, so it looks in a mirror, or on the
+    floor below, as it does to the camera. Where fields are partly transparent, what they add is
+    not additive along the ray: a surface within such a field splits it, and both parts decoded
+    on their own differ a little from the whole decoded at once.
+
+    There are no derivatives; :monosp:`nerf` has them.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="nerf_path">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'nerf_path',
+            'max_depth': 8
+    """
 
     plugin = "nerf_path"
     rays_per_pass = 1 << 20  # paths remember more than rays do
@@ -25,14 +94,17 @@ class NerfPathIntegrator(MarchingIntegrator):
         self._integer(props, "max_depth", -1, least=0)
         self._integer(props, "rr_depth", 5, least=1)
         super().__init__(props)
+        if props.get("max_depth", -1) < 0:  # the base class has a default of its own
+            self.max_depth = _UNLIMITED
         self.sample_fields = bool(props.get("sample_fields", True))
         self._solid = SolidScene()
 
     def to_string(self) -> str:
         """Lists the settings."""
+        depth = "unlimited" if self.max_depth == _UNLIMITED else self.max_depth
         return (
             "NerfPathIntegrator[\n"
-            f"  max_depth = {self.max_depth}, rr_depth = {self.rr_depth},\n"
+            f"  max_depth = {depth}, rr_depth = {self.rr_depth},\n"
             f"{self._settings()}"
             f"  sample_fields = {self.sample_fields}\n"
             "]"
@@ -66,6 +138,7 @@ class NerfPathIntegrator(MarchingIntegrator):
         return Stage(fields, PathsBehind(solid, fields, settings, normals), normals)
 
 
+_UNLIMITED = 2**31 - 1
 _NO_DERIVATIVES = "nerf_path: has no derivatives, expected the integrator 'nerf' for them"
 
 mi.register_integrator("nerf_path", NerfPathIntegrator)

@@ -105,7 +105,14 @@ class _Chance:
     roulette: Any
     field: Any
     field_point: Any
-    jitter: list[Any]  # of the segments to an emitter, to a field, and of the path
+    jitter: list[Any]  # of the segments to an emitter, to a field, and of the path; or None
+
+    def take(self, index: Any) -> _Chance:
+        """Those of some paths."""
+        names = [f.name for f in fields(self) if f.name != "jitter"]
+        kept = {name: _gather(getattr(self, name), index) for name in names}
+        jitter = [None if v is None else _gather(v, index) for v in self.jitter]
+        return _Chance(**kept, jitter=jitter)
 
 
 class PathsBehind(Backdrop):
@@ -205,7 +212,7 @@ class PathsBehind(Backdrop):
         )
         dr.make_opaque(paths, ends)
         for depth in itertools.count():
-            chance = self._chance(sampler, paths.slot, len(image.alpha))
+            chance = self._chance(sampler, paths.slot)
             following, going = self._bounce(paths, ends, depth, chance, image)
             alive = mi.UInt32(dr.compress(going))
             if not len(alive):
@@ -350,7 +357,7 @@ class PathsBehind(Backdrop):
             image.add(_gather(slot, lit), light * see(self._fields, rays).color)
             dr.eval(image)
 
-    def _chance(self, sampler: Any, slot: Any, count: int) -> _Chance:
+    def _chance(self, sampler: Any, slot: Any) -> _Chance:
         """Draws for all R camera rays, so that the sampler keeps its order; N are kept."""
         one, two = sampler.next_1d, sampler.next_2d
         jitter = [one() for _ in range(3)] if self._settings.jitter else [None] * 3
@@ -358,13 +365,7 @@ class PathsBehind(Backdrop):
         chance = _Chance(two(), two(), one(), one(), one(), point, jitter)
         sampler.schedule_state()
         dr.eval(chance)
-        if len(slot) == count:
-            return chance
-        kept = [getattr(chance, f.name) for f in fields(chance)][:-1]
-        return _Chance(
-            *(_gather(v, slot) for v in kept),
-            [None if v is None else _gather(v, slot) for v in jitter],
-        )
+        return chance.take(slot)
 
 
 def _gather(value: Any, index: Any) -> Any:
