@@ -18,6 +18,7 @@ from ..rendering import (
     scene_frames,
     write_frames,
 )
+from ..scene_library import scenes
 from ..target import open_target
 from .shared import Variant, positive, progress_bar
 
@@ -33,10 +34,12 @@ class Render:
     mi-nerf render runs/lego -o test_views/ --path test
 
     mi-nerf render scene.xml -o scene.exr --spp 64
+
+    mi-nerf render table -o table.png
     """
 
     target: Positional[Annotated[Path, arg(metavar="TARGET")]]
-    """A run folder or a Mitsuba XML scene."""
+    """A run folder, a Mitsuba XML scene, or the name of a scene that comes with mi_nerf."""
     out: Annotated[Path, arg(aliases=["-o"])]
     """An .exr, .png or .mp4 file, or a folder of pictures."""
     path: Literal["orbit", "spiral", "test"] | None = None
@@ -59,14 +62,11 @@ class Render:
             raise InputError(
                 f"--size {self.size[0]} {self.size[1]}: expected two numbers of at least 1"
             )
-        if not self.target.exists():
-            raise InputError(
-                f"{self.target}: not found, expected a run folder or a Mitsuba XML scene"
-            )
+        place = self._target()
         picture = output_kind(self.out) == "picture"
         check_output(self.out, self.frames or 1)
         variant = choose_variant(self.variant)
-        if self.target.suffix.lower() == ".xml":
+        if place.suffix.lower() == ".xml":
             if self.frames is not None and self.path is None:
                 raise InputError(
                     f"--frames {self.frames}: the sensors of a scene give one frame each, "
@@ -74,7 +74,7 @@ class Render:
                 )
             frames = 1 if picture else 60
             count, images = scene_frames(
-                self.target,
+                place,
                 variant,
                 path=self.path,
                 frames=self.frames or frames,
@@ -82,7 +82,7 @@ class Render:
                 spp=self.spp or 0,
             )
         else:
-            target = open_target(self.target)
+            target = open_target(place)
             path = self.path or default_path(target)
             frames = 1 if picture else (0 if path == "test" else 60)
             count, images = run_frames(
@@ -96,3 +96,15 @@ class Render:
         with progress_bar("render", "frame", count) as bar:
             write_frames(self.out, count, images, on_frame=bar.update)
         print(f"{self.out}: {count} frame{'s' if count != 1 else ''}")
+
+    def _target(self) -> Path:
+        """What to render: something at a path, or else a scene by name."""
+        if self.target.exists():
+            return self.target
+        found = scenes().get(str(self.target))
+        if found is None:
+            raise InputError(
+                f"{self.target}: not found, expected a run folder or a Mitsuba XML scene, or "
+                "the name of one that comes with mi_nerf"
+            )
+        return found
