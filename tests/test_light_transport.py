@@ -126,6 +126,18 @@ def test_without_fields_it_is_a_path_tracer(options: dict[str, Any]) -> None:
         np.testing.assert_allclose(seen[0][..., 3], expected[0][..., 3], atol=1e-6)
 
 
+@pytest.mark.parametrize("sampler", ["independent", "stratified", "multijitter"])
+def test_without_surfaces_it_shows_what_nerf_shows(sampler: str) -> None:
+    objects = {"field": formula_dict("gaussian"), "other": slab(place().scale(0.5), 0.4, GLOW)}
+    images = []
+    for integrator in (paths(), nerf(None)):
+        scene = scene_of(integrator, spp=4, **objects)
+        scene["sensor"]["sampler"]["type"] = sampler
+        images.append(render(scene))
+    np.testing.assert_allclose(images[0], images[1], atol=1e-6)
+    assert images[0].max() > 0.5
+
+
 def test_depth_zero_shows_nothing() -> None:
     image = render(scene_of(paths(max_depth=0), field=slab(place(), 1.0, GLOW), sky=sky()))
     assert image[..., :3].max() == 0

@@ -81,15 +81,14 @@ class _Connections:
     """Segments from N surfaces to something that may light them."""
 
     ray: Any
-    reach: Any  # where they end
+    reach: Any  # where they end, one number or N
     light: Any  # what arrives, or by what the light there is weighed; 0 where there is none
 
     def take(self, jitter: Any) -> tuple[Any, Rays, Any]:
         """Those that bring anything: their numbers, the rays, and ``light``."""
         lit = mi.UInt32(dr.compress(dr.max(self.light) > 0))
-        o, d, reach, light = (
-            _gather(v, lit) for v in (self.ray.o, self.ray.d, self.reach, self.light)
-        )
+        reach = self.reach if len(self.reach) == 1 else _gather(self.reach, lit)
+        o, d, light = (_gather(v, lit) for v in (self.ray.o, self.ray.d, self.light))
         jitter = None if jitter is None else _gather(jitter, lit)
         dr.eval(o, d, reach, light, jitter)
         return lit, Rays(o, d, reach, jitter), light
@@ -251,14 +250,16 @@ class PathsBehind(Backdrop):
         si = ends.pi.compute_surface_interaction(ends.ray, mi.RayFlags.All)
         bsdf = si.bsdf(ends.ray)
         image.add(paths.slot, self._emitted(si, paths, depth))
+        if depth + 1 >= self._settings.max_depth:
+            image.cover(paths.slot, dr.select(si.is_valid(), paths.clear, 0))
+            dr.eval(image)
+            return paths, mi.Bool(False)
         active = si.is_valid() & (dr.max(paths.throughput) > 0)
-        active &= mi.Bool(depth + 1 < self._settings.max_depth)
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         from_emitters = self._to_emitters(si, bsdf, paths, chance, smooth)
         from_fields = self._to_fields(si, bsdf, paths, chance, smooth)
         following, going = self._turn(si, bsdf, paths, depth, chance, active)
-        covered = dr.select(si.is_valid(), paths.clear - following.clear, 0)
-        image.cover(paths.slot, covered)
+        image.cover(paths.slot, dr.select(si.is_valid(), paths.clear - following.clear, 0))
         dr.eval(image, from_emitters, from_fields, following, going)
         self._add_emitters(from_emitters, paths.slot, chance.jitter[0], image)
         self._add_fields(from_fields, paths.slot, chance.jitter[1], image)
@@ -298,7 +299,7 @@ class PathsBehind(Backdrop):
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(d), active)
         weight = mis_weight(density, pdf) / dr.select(active, density, 1)
         light = dr.select(active, paths.throughput * value * weight, 0)
-        return _Connections(si.spawn_ray(d), None, light)
+        return _Connections(si.spawn_ray(d), mi.Float(dr.inf), light)
 
     def _turn(
         self, si: Any, bsdf: Any, paths: _Paths, depth: int, chance: _Chance, active: Any
@@ -350,12 +351,14 @@ class PathsBehind(Backdrop):
         """Adds the light of fields before the first surface."""
         if connections is None:
             return
-        pi = self._scene.ray_intersect_preliminary(connections.ray, coherent=False)
-        connections.reach = pi.t
         lit, rays, light = connections.take(jitter)
-        if len(lit):
-            image.add(_gather(slot, lit), light * see(self._fields, rays).color)
-            dr.eval(image)
+        if not len(lit):
+            return
+        first = mi.Ray3f(rays.o, rays.d)
+        rays.reach = self._scene.ray_intersect_preliminary(first, coherent=False).t
+        dr.eval(rays.reach)
+        image.add(_gather(slot, lit), light * see(self._fields, rays).color)
+        dr.eval(image)
 
     def _chance(self, sampler: Any, slot: Any) -> _Chance:
         """Draws for all R camera rays, so that the sampler keeps its order; N are kept."""
