@@ -579,9 +579,9 @@ def test_normalised_device_coordinates_stand_alone(tmp_path: Path) -> None:
 
 def test_a_pose_is_recovered_from_an_image() -> None:
     """The recipe of README: descent on a field's place, from a picture of it elsewhere."""
-    field = formula_dict("two_color", place().scale([0.5, 0.3, 0.2]), density=6.0)
+    field = formula_dict("two_color", place().scale([0.8, 0.5, 0.4]), density=6.0)
     field["interior"]["axis"] = mi.ScalarVector3f(1, 0, 0)
-    scene = mi.load_dict(scene_of(nerf(), field=field, wall=wall(1.5), sky=sky()))
+    scene = mi.load_dict(scene_of(nerf(), field=field, back=lamp(1.5, (0.1, 0.2, 0.3))))
     params = mi.traverse(scene)
 
     def move(shift: Any, angle: Any) -> None:
@@ -593,16 +593,16 @@ def test_a_pose_is_recovered_from_an_image() -> None:
     true_shift, true_angle = [0.3, -0.4, 0.5], 25.0
     move(mi.Vector3f(true_shift), mi.Float(true_angle))
     target = mi.render(scene, spp=64, seed=1)
-    optimizer = mi.ad.Adam(lr=0.03)
+    optimizer = mi.ad.Adam(lr=0.05)
     optimizer["shift"], optimizer["turn"] = mi.Vector3f(0), mi.Float(0)
     losses = []
-    for step in range(120):
+    for step in range(60):
         move(optimizer["shift"], 30 * optimizer["turn"])
-        image = mi.render(scene, params, spp=4, seed=2 * step, seed_grad=2 * step + 1)
+        image = mi.render(scene, params, spp=8, seed=2 * step, seed_grad=2 * step + 1)
         loss = dr.mean(dr.square(image - target), axis=None)
         dr.backward(loss)
         optimizer.step()
         losses.append(float(loss.array[0]))
     assert losses[-1] < losses[0] / 10
-    np.testing.assert_allclose(np.ravel(optimizer["shift"]), true_shift, atol=0.1)
-    assert 30 * float(optimizer["turn"][0]) == pytest.approx(true_angle, abs=4)
+    np.testing.assert_allclose(np.ravel(optimizer["shift"]), true_shift, atol=0.06)
+    assert 30 * float(optimizer["turn"][0]) == pytest.approx(true_angle, abs=3)

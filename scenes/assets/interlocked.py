@@ -25,7 +25,7 @@ def ring(radius: float, thickness: float) -> tuple[Array, Array, Array]:
 
 def main() -> None:
     """Writes the mesh."""
-    vertices, faces, normals = ring(0.78, 0.045)
+    vertices, faces, normals = ring(0.92, 0.04)
     write_ply(output_folder() / "interlocked_ring.ply", vertices, faces, normals=normals)
 
 
