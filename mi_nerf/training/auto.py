@@ -2,11 +2,13 @@
 
 It starts from preset ``fast`` and departs from it only where there is a measured reason.
 What follows from the data alone (box, resolution, samples, batch, activations) is fixed
-first. Then probes answer, as long as their share of the budget lasts:
+first. Then training begins, on most of the views, and is judged on the others; the run
+goes on from there. Other models begin in its place as long as their share of the budget
+lasts, and the run goes on with whichever did best:
 
-1. Does colour depend on the direction of view? A small model is judged on views that were
-   held back, and judged again with its light averaged over directions. Where that does not
-   hurt, it is trained once more without directions; if that does not hurt either, they go.
+1. Does colour depend on the direction of view? The model is judged again with its light
+   averaged over directions. Where that costs little, another begins without directions;
+   if it keeps up, step by step, directions go.
 2. How wide, how deep? The larger of two networks has to gain more, at the same number of
    steps, than the smaller one would in the time that the larger one costs.
 3. A hash grid, or Fourier features alone? At the same number of steps.
@@ -29,16 +31,15 @@ from . import probes
 from .config import TrainConfig, to_json, with_settings
 from .presets import nerf, preset
 from .probes import Probe, Probes
-from .trainer import carved_cells, field_config, resolved_octaves
+from .trainer import Trainer, carved_cells, field_config, resolved_octaves
 
-# Probes of 350 steps: a diffuse scene came to 0.3 and 0.45 dB, a glossy one to 0 and -0.2.
-DIRECTIONS_MARGIN = 0.15  # dB that both tests together have to gain without directions
+# Of 400 steps on 200×200 pixels: a diffuse scene lost 0.0 and 0.14 dB, a glossy one 0.35
+# and 0.45 dB. Without directions a step takes less time, which makes up for 0.2 dB.
+MOST_LOST = 0.2  # dB that either test may lose without directions
 MARGIN = 0.05  # dB that a larger model, or another kind, has to gain at any rate
-MOST_LOST = 0.25  # dB that a smaller network may lose at the same number of steps
-_LEVELS = 4  # of a probe's hash grid
-_SMALLER, _USUAL = (1, 32), (1, 64)  # depth and width; the latter that of preset ``fast``
+_USUAL = (1, 64)  # depth and width of preset ``fast``; with 32 neurons a step takes as long
 _LARGER = ((2, 64), (2, 128))  # as they grow
-_FOURIER_COST = 6  # a step of Fourier features in steps of a small hash grid, at most
+_FOURIER_COST = 3  # a step of Fourier features in steps of a hash grid of four times the batch
 _MEMORY_SHARE = 0.125  # of the machine's, for what one step keeps
 _BYTES_PER_QUERY = 8192  # activations, their gradients, samples: generous for a narrow network
 
@@ -55,6 +56,15 @@ class Decision:
         return f"{self.setting} = {_text(self.value, '.4g')}: {self.reason}"
 
 
+@dataclass(frozen=True)
+class Choice:
+    """The configuration for a dataset, every setting that was chosen, and what is trained."""
+
+    config: TrainConfig
+    decisions: list[Decision]
+    trainer: Trainer | None = None  # that has begun with this configuration
+
+
 def choose(
     config: TrainConfig,
     dataset: Dataset,
@@ -62,27 +72,31 @@ def choose(
     *,
     given: Collection[str] = (),
     clock: Callable[[], float] = time.monotonic,
-) -> tuple[TrainConfig, list[Decision]]:
-    """The configuration for a dataset, and every setting that was chosen for it.
+) -> Choice:
+    """Chooses the configuration for a dataset.
 
     Args:
         config: of preset ``auto``. What differs from the preset is kept.
         given: names of settings that are kept even where they do not differ.
         clock: seconds, as they count for ``config.max_seconds``.
     """
-    choice = _Choice(config, set(given) | _changed(config))
+    choice = _Settings(config, set(given) | _changed(config))
     _settle_data(choice, dataset)
     field = field_config(choice.config, dataset)
     cells = carved_cells(choice.config, dataset, field)
     _settle_sampling(choice, float(cells.mean()))
     if len(dataset) < probes.FEWEST_VIEWS:
         choice.leave(f"{len(dataset)} views, too few to hold any back")
-    else:
-        _Questions(choice, Probes(choice.config, dataset, backend, cells, clock)).answer()
-    return choice.config, choice.decisions
+        return Choice(choice.config, choice.decisions)
+    best = _Questions(choice, Probes(choice.config, dataset, backend, cells, clock)).answer()
+    trainer = None if best is None else best.trainer
+    if trainer is not None and trainer.config == choice.config:
+        trainer.learn_from(dataset)
+        return Choice(choice.config, choice.decisions, trainer)
+    return Choice(choice.config, choice.decisions)
 
 
-class _Choice:
+class _Settings:
     """A configuration that takes shape."""
 
     def __init__(self, config: TrainConfig, fixed: set[str]) -> None:
@@ -109,7 +123,7 @@ class _Choice:
 # ---- From the data alone ---------------------------------------------------------
 
 
-def _settle_data(choice: _Choice, dataset: Dataset) -> None:
+def _settle_data(choice: _Settings, dataset: Dataset) -> None:
     """Box, resolution, and how colours and errors are expressed."""
     config = choice.config
     field = field_config(config, dataset)
@@ -135,7 +149,7 @@ def _settle_data(choice: _Choice, dataset: Dataset) -> None:
         choice.take("background", "random" if dataset.has_alpha else "white", alpha)
 
 
-def _settle_sampling(choice: _Choice, occupied: float) -> None:
+def _settle_sampling(choice: _Settings, occupied: float) -> None:
     """Strata a ray and queries a step."""
     grid = choice.config.grid
     if grid is not None and grid.finest is not None:
@@ -181,85 +195,68 @@ def fitting_batch(wanted: int, samples: int, memory: int) -> int:
 class _Questions:
     """What only training can tell; each answer is the ground for the next question."""
 
-    def __init__(self, choice: _Choice, runs: Probes) -> None:
+    def __init__(self, choice: _Settings, runs: Probes) -> None:
         self._choice, self._runs = choice, runs
         self._grows = choice.open("network.depth", "network.width", "network.view_width")
 
-    def answer(self) -> None:
-        """Asks them all, as far as the budget goes."""
+    def answer(self) -> Probe | None:
+        """Asks them all, as far as the budget goes; returns the probe to go on with."""
         choice = self._choice
         directions = choice.open("network.view_d")
         features = choice.open("grid", "position") and choice.config.grid is not None
         if not (directions or self._grows or features):
-            return
-        first = self._runs.train(self._small())
-        if first is None:
+            return None
+        best = self._runs.first(choice.config)
+        if best is None or not best.told:
             choice.leave("the budget is too short for probes")
-            return
-        base = self._directions(first) if directions else first
-        base = self._size(base) if self._grows else base
-        if features:
-            self._features(base)
+            return best
+        best = self._directions(best) if directions else best
+        best = self._size(best) if self._grows else best
+        return self._features(best) if features else best
 
-    def _small(self, *settings: str) -> TrainConfig:
-        """The model so far, with a smaller grid."""
-        levels = self._choice.config.grid and self._choice.open("grid.levels")
-        return with_settings(
-            self._choice.config, [*([f"grid.levels={_LEVELS}"] if levels else []), *settings]
-        )
+    def _probe(self, like: Probe, *settings: str, cost: float = 1.0) -> Probe | None:
+        """A probe of the model so far with some settings changed, if there is time."""
+        config = with_settings(self._choice.config, list(settings))
+        return self._runs.another(config, like, cost)
 
     def _directions(self, seeing: Probe) -> Probe:
-        """Leaves directions out if that costs nothing; returns the probe of what remains."""
+        """Leaves directions out if that costs little; returns the probe of what remains."""
         choice, setting, even = self._choice, "network.view_dependent", seeing.averaged
         why = (
             f"{len(self._runs)} views held back have {seeing.quality:.2f} dB after "
             f"{seeing.steps} steps, {even:.2f} with light averaged over directions"
         )
-        if even < seeing.quality:
+        if even < seeing.quality - MOST_LOST:
             choice.take(setting, True, why)
             return seeing
-        without = ["network.view_dependent=false", "network.view_depth=0"]
-        blind = self._runs.train(self._small(*without), like=seeing)
+        blind = self._probe(seeing, f"{setting}=false", "network.view_depth=0")
         if blind is None:
             choice.take(setting, True, f"{why}, but no time for a probe without directions")
             return seeing
+        needless = blind.quality >= seeing.quality - MOST_LOST
         why += f", {blind.quality:.2f} trained without directions"
-        gain = blind.quality - seeing.quality
-        needless = gain >= 0 and gain + even - seeing.quality >= DIRECTIONS_MARGIN
+        why += f", at {1e3 * blind.seconds:.1f} instead of {1e3 * seeing.seconds:.1f} ms a step"
         choice.take(setting, not needless, why)
         if needless:
             choice.take("network.view_depth", 0, "without directions, no layers behind them")
         return blind if needless else seeing
 
     def _size(self, usual: Probe) -> Probe:
-        """Shrinks or grows the network as it pays; returns the probe of what it came to."""
-        smaller = self._sized(_SMALLER, usual)
-        if smaller is None:
-            self._take_shape(_USUAL, "as in preset fast: no time for a probe of another size")
-            return usual
-        said = [_report(_SMALLER, smaller), _report(_USUAL, usual)]
-        lost = usual.quality - smaller.quality
-        if lost <= MOST_LOST and not worth_growing(smaller, usual):
-            self._take_shape(_SMALLER, ", ".join(said))
-            return smaller
-        best, shape = usual, _USUAL
+        """Grows the network as long as it pays; returns the probe of what it came to."""
+        best, shape, said = usual, _USUAL, [_report(_USUAL, usual)]
         for larger in _LARGER:
-            probe = self._sized(larger, best)
+            cost = larger[0] * larger[1] / (shape[0] * shape[1])
+            probe = self._probe(best, *_shape(*larger), cost=cost)
             if probe is None:
                 break
             said.append(_report(larger, probe))
             if not worth_growing(best, probe):
                 break
             best, shape = probe, larger
+        if len(said) == 1:
+            said.append("as in preset fast: no time for a probe of a larger one")
         self._take_shape(shape, ", ".join(said))
         return best
-
-    def _sized(self, shape: tuple[int, int], like: Probe) -> Probe | None:
-        """A probe of a network of another size, if there is time."""
-        cost = shape[0] * shape[1] / _USUAL[1]
-        if not self._runs.affords(cost * like.steps * like.seconds, like.steps):
-            return None
-        return self._runs.train(self._small(*_shape(*shape)), like=like)
 
     def _take_shape(self, shape: tuple[int, int], why: str) -> None:
         depth, width = shape
@@ -267,14 +264,13 @@ class _Questions:
         self._choice.take("network.view_width", width, "as network.width")
         self._choice.take("network.depth", depth, "with network.width")
 
-    def _features(self, hashed: Probe) -> None:
+    def _features(self, hashed: Probe) -> Probe:
         """Fourier features alone, if they have learnt more in as many steps."""
         choice = self._choice
-        why, probe = "as in preset fast: no time for a probe of Fourier features", None
-        if self._runs.affords(_FOURIER_COST * hashed.steps * hashed.seconds, hashed.steps):
-            trial = _Choice(choice.config, set())
-            _settle_fourier(trial, "")
-            probe = self._runs.train(trial.config, like=hashed)
+        trial = _Settings(choice.config, set())
+        _settle_fourier(trial, "")
+        why = "as in preset fast: no time for a probe of Fourier features"
+        probe = self._runs.another(trial.config, hashed, _FOURIER_COST)
         if probe is not None:
             why = (
                 f"after {hashed.steps} steps {hashed.quality:.2f} dB with a hash grid, "
@@ -282,9 +278,10 @@ class _Questions:
             )
             if probe.quality >= hashed.quality + MARGIN:
                 _settle_fourier(choice, why)
-                return
+                return probe
         assert choice.config.grid is not None
         choice.take("grid.levels", choice.config.grid.levels, why)
+        return hashed
 
 
 def worth_growing(smaller: Probe, larger: Probe) -> bool:
@@ -293,7 +290,7 @@ def worth_growing(smaller: Probe, larger: Probe) -> bool:
     return larger.quality - smaller.quality > max(rivals, MARGIN)
 
 
-def _settle_fourier(choice: _Choice, why: str) -> None:
+def _settle_fourier(choice: _Settings, why: str) -> None:
     """The network of preset ``nerf`` in place of a hash grid."""
     model, network = nerf(), nerf().network
     choice.take("grid", None, why)

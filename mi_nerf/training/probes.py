@@ -11,22 +11,22 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+from tqdm import tqdm
 
 from ..arrays import vector3_type
 from ..data import Dataset
 from ..field import NeuralField
 from .batches import RaySource, step_rng
-from .config import TrainConfig, with_settings
+from .config import TrainConfig
 from .schedule import learning_rate
 from .trainer import Trainer
 
-SHARE = 0.12  # of a run's budget, for all probes together
-BATCH = 4096  # field queries a step of a probe, at most
-STEPS = 350  # of a probe in a run of two minutes or less; up to four times as many in longer ones
-FEWEST = 250  # a shorter probe tells nothing
+SHARE = 0.12  # of a run's budget, for probes that lead nowhere
+FIRST = 0.11  # of a run's budget, for the first probe, with which training usually goes on
+STEPS = 400  # of a probe in a run of two minutes or less; more in longer ones
+FEWEST = 300  # a shorter probe tells nothing
 FEWEST_VIEWS = 5  # with fewer there is none to hold back
 _MOST_VIEWS = 8  # to hold back
-_FIRST = 0.65  # of the seconds left, for a first probe: it may have to compile
 _PACED = 40  # steps after which it is clear how many there is time for
 _PIXELS = 16384  # held-back ones that judge a field, at most
 _SEED = 77  # of their choice, the same for all probes
@@ -35,20 +35,27 @@ _DIRECTIONS = 8  # from which light is averaged
 
 @dataclass(frozen=True)
 class Probe:
-    """What a short training came to."""
+    """What the first steps of a training came to."""
 
     steps: int
     seconds: float  # a step, median
     quality: float  # of the pixels held back, dB: -10 log10 of the loss
     slope: float  # dB that the second half of the steps brought
     averaged: float  # quality with light averaged over directions of view
+    trainer: Trainer | None = None  # to go on with
+
+    @property
+    def told(self) -> bool:
+        """Whether there was time for enough steps to judge anything."""
+        return self.steps >= FEWEST
 
 
 class Probes:
-    """Trains one configuration after the other within a share of a run's budget.
+    """Begins to train one configuration after the other, as a run would.
 
-    Of a limit in seconds they take at most :data:`SHARE`, but for the step that is under
-    way when it ends; of a limit in steps, as many as make that share of its queries.
+    The run can go on with any of them, so that only those that lead nowhere cost it
+    anything: at most :data:`SHARE` of its budget, for which what is left of it by the pace
+    of earlier probes has to suffice, and the time in which their kernels are compiled.
     """
 
     def __init__(
@@ -69,14 +76,14 @@ class Probes:
         held = [(2 * i + 1) * len(dataset) // (2 * count) for i in range(count)]
         self._held_back = dataset.subset(held)
         self._others = dataset.subset([i for i in range(len(dataset)) if i not in held])
-        self._deadline, self._steps_left, goal = math.inf, math.inf, float(STEPS)
-        if config.max_seconds is not None:
-            self._deadline = clock() + SHARE * config.max_seconds
-            goal *= min(max(config.max_seconds / 120, 1), 4)
+        limit, goal = config.max_seconds or math.inf, float(STEPS)
+        if math.isfinite(limit):
+            goal *= math.sqrt(max(limit / 120, 1))
+        self._first_seconds = FIRST * limit
+        self._seconds_left, self._steps_left = SHARE * limit, math.inf
         if config.steps is not None:
-            batch = config.sampling.batch
-            self._steps_left = SHARE * config.steps * batch / min(BATCH, batch)
-            goal = min(goal, self._steps_left / 2)  # two at least, to compare
+            self._steps_left = SHARE * config.steps
+            goal = min(goal, self._steps_left)
         self._goal = int(goal)
 
     def __len__(self) -> int:
@@ -84,56 +91,71 @@ class Probes:
         return len(self._held_back)
 
     def affords(self, seconds: float, steps: int) -> bool:
-        """Whether the budget has room for so much more."""
-        return self._clock() + seconds <= self._deadline and steps <= self._steps_left
+        """Whether the budget has room for so much that may lead nowhere."""
+        return seconds <= self._seconds_left and steps <= self._steps_left
 
-    def train(self, config: TrainConfig, like: Probe | None = None) -> Probe | None:
-        """Trains and judges; ``None`` if the budget ends before it tells anything.
+    def first(self, config: TrainConfig) -> Probe | None:
+        """Trains and judges as many steps as there is time for.
+
+        Returns:
+            What they came to. If there was time for a few only, these, not judged, to go
+            on with; ``None`` if there was not even time to begin.
+        """
+        return None if self._goal < FEWEST else self._train(config, self._goal, paced=True)
+
+    def another(self, config: TrainConfig, like: Probe, cost: float = 1.0) -> Probe | None:
+        """Trains and judges another configuration for as many steps, if there is time.
 
         Args:
-            like: the probe to compare with, whose number of steps is taken. Without it,
-                some of the budget stays for such a comparison.
+            like: the probe to compare with.
+            cost: of a step, expected, in steps of that probe.
         """
-        now = self._clock()
-        share = _FIRST if like is None else 1.0
-        limit = now + share * (self._deadline - now) if math.isfinite(self._deadline) else math.inf
-        goal = self._goal if like is None else like.steps
-        if goal < FEWEST or not self.affords(0, goal):
+        if not self.affords(cost * like.steps * like.seconds, like.steps):
             return None
-        trainer = Trainer(_short(config, goal), self._others, self._backend, self._cells)
+        found = self._train(config, like.steps, paced=False)
+        self._seconds_left -= found.seconds * found.steps
+        self._steps_left -= found.steps
+        return found if math.isfinite(found.quality) else None
+
+    def _train(self, config: TrainConfig, goal: int, paced: bool) -> Probe:
+        """The first steps of a training; ``paced`` adapts their number to the time left."""
+        trainer = Trainer(config, self._others, self._backend, self._cells)
         pixels = self._pixels(trainer)
         durations: list[float] = []
         halfway, previous = math.nan, None
-        while trainer.step_count < goal and self._clock() < limit:
-            begin = self._clock()
-            result = _step(trainer, goal)
-            if previous is not None:
-                float(previous.loss[0])  # waits, for the step before
-            previous = result
-            durations.append(self._clock() - begin)
-            self._steps_left -= 1
-            if trainer.step_count == _PACED and like is None:
-                goal = min(goal, self._fitting(durations[_PACED // 2 :], limit))
-                if goal < FEWEST:
-                    return None
-            if trainer.step_count == goal // 2:
-                halfway = _decibels(trainer.validate(pixels))
+        bar = tqdm(total=goal, desc=_title(config), unit="step", leave=False, disable=None)
+        with bar:
+            while trainer.step_count < goal:
+                begin = self._clock()
+                result = trainer.step(learning_rate(config.optimizer, 0.0, trainer.step_count))
+                if previous is not None:
+                    float(previous.loss[0])  # waits, for the step before
+                previous = result
+                durations.append(self._clock() - begin)
+                bar.update()
+                if trainer.step_count == goal // 2:
+                    halfway = _decibels(trainer.validate(pixels))
+                if paced and trainer.step_count == _PACED:
+                    goal = min(goal, self._fitting(durations[_PACED // 2 :]))
+                    bar.total = goal
+        seconds = statistics.median(durations)
+        if goal < FEWEST:
+            return Probe(goal, seconds, math.nan, math.nan, math.nan, trainer)
         found = _decibels(trainer.validate(pixels))
-        if trainer.step_count < goal or not math.isfinite(found + halfway):
-            return None
         return Probe(
             steps=goal,
-            seconds=statistics.median(durations),
+            seconds=seconds,
             quality=found,
             slope=max(0.0, found - halfway),
             averaged=self._averaged(trainer, pixels, found),
+            trainer=trainer,
         )
 
-    def _fitting(self, durations: list[float], limit: float) -> int:
-        """How many steps there is time for, by the pace of the last ones."""
+    def _fitting(self, durations: list[float]) -> int:
+        """How many steps there is time for, by the pace of the last ones; few if too few."""
         pace = statistics.median(durations)
-        left = 0.9 * (limit - self._clock())
-        return _PACED + int(min(left / max(pace, 1e-9), 1e9))
+        goal = int(min(self._first_seconds / max(pace, 1e-9), 1e9))
+        return goal if goal >= FEWEST else _PACED
 
     def _pixels(self, trainer: Trainer) -> Any:
         """Pixels of the views held back, chosen alike for all probes."""
@@ -183,24 +205,10 @@ class _EvenLight:
         return density, [c / total for c in colors]
 
 
-def _short(config: TrainConfig, steps: int) -> TrainConfig:
-    """The settings of a probe: smaller steps, and all that waits for later ones earlier."""
-    options = config.optimizer
-    return with_settings(
-        config,
-        [
-            f"sampling.batch={max(config.sampling.samples, min(BATCH, config.sampling.batch))}",
-            f"occupancy.start={min(config.occupancy.start, steps // 3)}",
-            f"optimizer.warmup={min(options.warmup, 20)}",
-            "crop_steps=0",
-        ],
-    )
-
-
-def _step(trainer: Trainer, goal: int) -> Any:
-    """A step whose learning rate has come half the way of a run's at the end of the probe."""
-    done = trainer.step_count
-    return trainer.step(learning_rate(trainer.config.optimizer, 0.5 * done / goal, done))
+def _title(config: TrainConfig) -> str:
+    features = "Fourier features" if config.grid is None else "hash grid"
+    seen = "" if config.network.view_dependent else ", no directions"
+    return f"probing {features}, {config.network.depth}x{config.network.width}{seen}"
 
 
 def _decibels(loss: float) -> float:

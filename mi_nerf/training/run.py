@@ -22,7 +22,7 @@ from ..field_file import FieldFile, save_field
 from ..files import check_folder, make_folder, read_json, write_json
 from ..interrupts import interruptible
 from ..volume import MarchSettings
-from .auto import Decision, choose
+from .auto import Choice, Decision, choose
 from .checkpoint import load_checkpoint, save_checkpoint
 from .config import TrainConfig, from_json, to_json
 from .progress import Meter, ProgressBar
@@ -52,17 +52,23 @@ class Run:
         variant: str,
         *,
         started: float | None = None,
+        trainer: Trainer | None = None,
     ) -> None:
-        """``started`` is the value of ``time.monotonic()`` from which seconds count."""
+        """
+        Args:
+            started: the value of ``time.monotonic()`` from which seconds count.
+            trainer: of this configuration and dataset, to go on with if it has begun.
+        """
         self.folder, self.config, self.variant = folder, config, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
         self._started = time.monotonic() if started is None else started
-        self.trainer = Trainer(config, dataset, array_module(variant))
+        self.trainer = trainer or Trainer(config, dataset, array_module(variant))
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before this process
         self._skipped = 0
         self._skipped_in_row = 0
         self._attempt_start = 0
+        self._begun = self.trainer.step_count  # before the log began
         self._since = Meter()
         # Squared errors of the last steps, as many as tell a collapse from bad luck.
         self._recent: deque[float] = deque(maxlen=max(1, min(100, config.collapse_check // 2)))
@@ -90,6 +96,7 @@ class Run:
             self._before = float(state["seconds"])
             self._skipped = int(state["skipped"])
             self._attempt_start = int(state["attempt_start"])
+            self._begun = int(state.get("begun", 0))
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"{self.folder / CHECKPOINT}: damaged description of the progress: {error}"
@@ -129,6 +136,7 @@ class Run:
             "seconds": self.seconds,
             "skipped": self._skipped,
             "attempt_start": self._attempt_start,
+            "begun": self._begun,
         }
         save_checkpoint(self.folder / CHECKPOINT, self.trainer, progress)
         save_field(self.folder / FIELD, self.field_file())
@@ -190,7 +198,9 @@ class Run:
     def _collapsed(self) -> bool:
         """Whether the field is still no better than empty space when it should be."""
         age = self.trainer.step_count - self._attempt_start
-        if age != self.config.collapse_check or not self._recent:
+        first = self._begun if self._attempt_start == 0 else 0
+        due = max(self.config.collapse_check, first + (self._recent.maxlen or 0))
+        if age != due or not self._recent or self.config.collapse_check == 0:
             return False
         return float(np.mean(self._recent)) > 0.9 * self._blank
 
@@ -259,12 +269,12 @@ def start(
         raise InputError(f"{folder}: already holds a run, expected --resume or another folder")
     check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
-    decisions: list[Decision] = []
+    choice = Choice(config, [])
     if config.preset == "auto" and not recorded:
         started = time.monotonic() if started is None else started
-        config, decisions = choose(config, dataset, array_module(variant), given=given)
-    run = Run(folder, config, dataset, variant, started=started)
-    run.decisions = decisions
+        choice = choose(config, dataset, array_module(variant), given=given)
+    run = Run(folder, choice.config, dataset, variant, started=started, trainer=choice.trainer)
+    run.decisions = choice.decisions
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
         run.resume()

@@ -146,14 +146,8 @@ class Trainer:
         self.config, self._backend = config, backend
         self.field_config = field_config(config, dataset)
         self._hull = carved_cells(config, dataset, self.field_config) if cells is None else cells
-        background = config.background
-        if background == "auto":
-            background = "random" if dataset.has_alpha else "white"
         _require_memory(config)
-        self._noise_level = 0.0 if dataset.has_alpha else config.density.noise
-        self.background = background
-        self._source = RaySource(dataset, background, backend.Float)
-        self.blank_loss = blank_loss(dataset, background)
+        self.learn_from(dataset)
         loss = config.loss
         if loss == "auto":
             loss = "mse" if dataset.color_space == "srgb" else "relative"
@@ -162,6 +156,16 @@ class Trainer:
         self.attempt = 0  # restarts after a collapse so far
         self.rays_per_step = 0.0
         self.reset()
+
+    def learn_from(self, dataset: Dataset) -> None:
+        """Takes the rays of further steps from ``dataset``, a scene in the same box."""
+        background = self.config.background
+        if background == "auto":
+            background = "random" if dataset.has_alpha else "white"
+        self._noise_level = 0.0 if dataset.has_alpha else self.config.density.noise
+        self.background = background
+        self._source = RaySource(dataset, background, self._backend.Float)
+        self.blank_loss = blank_loss(dataset, background)
 
     def reset(self) -> None:
         """Fresh weights, moments and occupancy, from the seed and the attempt."""
