@@ -9,7 +9,8 @@ import mitsuba as mi
 from ..errors import InputError
 from .backdrop import SolidScene, check_no_loose_field
 from .marching import MarchingIntegrator
-from .paths import PathsBehind, PathSettings
+from .path_state import PathSettings
+from .paths import PathsBehind
 from .placement import find_fields
 from .stage import Stage
 

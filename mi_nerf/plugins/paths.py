@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, fields
 from typing import Any
 
 import drjit as dr
@@ -13,105 +12,10 @@ from mitsuba.ad.integrators.common import mis_weight
 from .backdrop import Backdrop, Behind
 from .crossing import Marched, Rays
 from .field_light import FieldLight
+from .path_state import Chance, Connections, Ends, Image, Paths, PathSettings, gather
 from .segments import see, transmittance
 
 _MOST_SURVIVE = 0.95  # of a wavefront in Russian roulette, as in Mitsuba's path tracer
-
-
-@dataclass(frozen=True)
-class PathSettings:
-    """How far and how often paths are followed."""
-
-    max_depth: int  # of the longest path, in segments
-    rr_depth: int  # from which on paths end at random
-    paths: int  # for every camera ray
-    hide_lights: bool  # from cameras
-    sample_fields: bool  # as light sources
-    jitter: bool  # of the samples on segments
-    stop: float  # what fields must let pass for a path to go on
-
-
-@dataclass
-class _Image:
-    """What R camera rays have gathered so far."""
-
-    radiance: Any
-    alpha: Any
-
-    def add(self, slot: Any, radiance: Any) -> None:
-        """Adds to some of the rays, each named once."""
-        dr.scatter_add(self.radiance, radiance, slot)
-
-    def cover(self, slot: Any, alpha: Any) -> None:
-        """Makes some of the rays more opaque."""
-        dr.scatter_add(self.alpha, alpha, slot)
-
-
-@dataclass
-class _Paths:
-    """The N paths that go on, each at the start of its next segment."""
-
-    slot: Any  # numbers of their camera rays
-    o: Any  # where the segment starts
-    d: Any
-    throughput: Any
-    eta: Any  # by which throughput was scaled at refractions
-    clear: Any  # what is left of a camera ray that went straight on; 0 after a turn
-    vertex: Any  # the surface that the segment comes from
-    pdf: Any  # of its direction, by the surface's BSDF
-    delta: Any  # whether that has no density: emitters and fields cannot be sampled so
-
-    def take(self, index: Any) -> _Paths:
-        """Some of them."""
-        kept = _Paths(*(_gather(getattr(self, f.name), index) for f in fields(self)))
-        dr.eval(kept)
-        return kept
-
-
-@dataclass
-class _Ends:
-    """Where the segments of N paths end."""
-
-    ray: Any
-    pi: Any  # what was hit
-
-
-@dataclass
-class _Connections:
-    """Segments from N surfaces to something that may light them."""
-
-    ray: Any
-    reach: Any  # where they end, one number or N
-    light: Any  # what arrives, or by what the light there is weighed; 0 where there is none
-
-    def take(self, jitter: Any) -> tuple[Any, Rays, Any]:
-        """Those that bring anything: their numbers, the rays, and ``light``."""
-        lit = mi.UInt32(dr.compress(dr.max(self.light) > 0))
-        reach = self.reach if len(self.reach) == 1 else _gather(self.reach, lit)
-        o, d, light = (_gather(v, lit) for v in (self.ray.o, self.ray.d, self.light))
-        jitter = None if jitter is None else _gather(jitter, lit)
-        dr.eval(o, d, reach, light, jitter)
-        return lit, Rays(o, d, reach, jitter), light
-
-
-@dataclass
-class _Chance:
-    """Random numbers of N paths for one vertex."""
-
-    emitter: Any
-    bsdf: Any
-    bsdf_component: Any
-    roulette: Any
-    field: Any
-    field_point: Any
-    jitter: list[Any]  # of the segments to an emitter, to a field, and of the path; or None
-
-    def take(self, index: Any) -> _Chance:
-        """Those of some paths."""
-        names = [f.name for f in fields(self) if f.name != "jitter"]
-        kept = {name: _gather(getattr(self, name), index) for name in names}
-        jitter = [None if v is None else _gather(v, index) for v in self.jitter]
-        return _Chance(**kept, jitter=jitter)
 
 
 class PathsBehind(Backdrop):
@@ -151,14 +55,14 @@ class PathsBehind(Backdrop):
         if self._normals:
             si = pi.compute_surface_interaction(start, mi.RayFlags.All)
             behind.normal = dr.select(si.is_valid(), si.sh_frame.n, 0)
-        behind.states = _Ends(start, pi)
+        behind.states = Ends(start, pi)
         dr.eval(behind.distance, behind.normal, start, pi)
         return behind
 
     def look(self, behind: Behind, ray: Any, sampler: Any, opacity: Any) -> None:
         """The radiance from there on, on average over paths."""
         settings, count = self._settings, dr.width(behind.distance)
-        image = _Image(dr.zeros(mi.Color3f, count), dr.zeros(mi.Float, count))
+        image = Image(dr.zeros(mi.Color3f, count), dr.zeros(mi.Float, count))
         dr.make_opaque(image.radiance, image.alpha)
         sampler = sampler.clone()
         going = dr.compress(1 - opacity > settings.stop) if settings.max_depth else mi.UInt32()
@@ -192,13 +96,13 @@ class PathsBehind(Backdrop):
 
     # ---------------------------------- Paths ----------------------------------
 
-    def _follow(self, first: _Ends, slot: Any, sampler: Any, image: _Image) -> None:
+    def _follow(self, first: Ends, slot: Any, sampler: Any, image: Image) -> None:
         """Adds what one path for each of some camera rays brings."""
         if not len(slot):
             return
-        ends = _Ends(_gather(first.ray, slot), _gather(first.pi, slot))
+        ends = Ends(gather(first.ray, slot), gather(first.pi, slot))
         one = dr.full(mi.Float, 1, len(slot))
-        paths = _Paths(
+        paths = Paths(
             slot=slot,
             o=ends.ray.o,
             d=ends.ray.d,
@@ -217,9 +121,9 @@ class PathsBehind(Backdrop):
             if not len(alive):
                 return
             paths, jitter = following.take(alive), chance.jitter[2]
-            ends = self._travel(paths, None if jitter is None else _gather(jitter, alive), image)
+            ends = self._travel(paths, None if jitter is None else gather(jitter, alive), image)
 
-    def _travel(self, paths: _Paths, jitter: Any, image: _Image) -> _Ends:
+    def _travel(self, paths: Paths, jitter: Any, image: Image) -> Ends:
         """Follows paths through the fields to the next surface."""
         ray = mi.Ray3f(paths.o, paths.d)
         pi = self._scene.ray_intersect_preliminary(ray, coherent=False)
@@ -237,11 +141,11 @@ class PathsBehind(Backdrop):
             paths.throughput *= through
             paths.clear *= through
             dr.eval(paths, image)
-        return _Ends(ray, pi)
+        return Ends(ray, pi)
 
     def _bounce(
-        self, paths: _Paths, ends: _Ends, depth: int, chance: _Chance, image: _Image
-    ) -> tuple[_Paths, Any]:
+        self, paths: Paths, ends: Ends, depth: int, chance: Chance, image: Image
+    ) -> tuple[Paths, Any]:
         """Gathers light where paths meet a surface.
 
         Returns:
@@ -265,7 +169,7 @@ class PathsBehind(Backdrop):
         self._add_fields(from_fields, paths.slot, chance.jitter[1], image)
         return following, going
 
-    def _emitted(self, si: Any, paths: _Paths, depth: int) -> Any:
+    def _emitted(self, si: Any, paths: Paths, depth: int) -> Any:
         """What the surfaces that were hit, or the sky, emit towards the paths."""
         before = dr.zeros(mi.Interaction3f)
         before.p = paths.vertex
@@ -275,8 +179,8 @@ class PathsBehind(Backdrop):
         return paths.throughput * mis_weight(paths.pdf, pdf) * ds.emitter.eval(si, shown)
 
     def _to_emitters(
-        self, si: Any, bsdf: Any, paths: _Paths, chance: _Chance, active: Any
-    ) -> _Connections:
+        self, si: Any, bsdf: Any, paths: Paths, chance: Chance, active: Any
+    ) -> Connections:
         """Towards light sources: what they would bring if no field were between."""
         ds, weight = self._scene.sample_emitter_direction(si, chance.emitter, True, active)
         active = active & (ds.pdf != 0)
@@ -285,11 +189,11 @@ class PathsBehind(Backdrop):
         light = dr.select(active, paths.throughput * value * weight, 0)
         # Of emitters at infinity the scene says a distance, within which not all fields lie.
         infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        return _Connections(mi.Ray3f(si.p, ds.d), dr.select(infinite, dr.inf, ds.dist), light)
+        return Connections(mi.Ray3f(si.p, ds.d), dr.select(infinite, dr.inf, ds.dist), light)
 
     def _to_fields(
-        self, si: Any, bsdf: Any, paths: _Paths, chance: _Chance, active: Any
-    ) -> _Connections | None:
+        self, si: Any, bsdf: Any, paths: Paths, chance: Chance, active: Any
+    ) -> Connections | None:
         """Towards fields: by what the light that comes from there counts."""
         if not self._light.boxes:
             return None
@@ -299,11 +203,11 @@ class PathsBehind(Backdrop):
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(d), active)
         weight = mis_weight(density, pdf) / dr.select(active, density, 1)
         light = dr.select(active, paths.throughput * value * weight, 0)
-        return _Connections(si.spawn_ray(d), mi.Float(dr.inf), light)
+        return Connections(si.spawn_ray(d), mi.Float(dr.inf), light)
 
     def _turn(
-        self, si: Any, bsdf: Any, paths: _Paths, depth: int, chance: _Chance, active: Any
-    ) -> tuple[_Paths, Any]:
+        self, si: Any, bsdf: Any, paths: Paths, depth: int, chance: Chance, active: Any
+    ) -> tuple[Paths, Any]:
         """The segments after the surface, and which paths go on with them."""
         sample, weight = bsdf.sample(
             mi.BSDFContext(), si, chance.bsdf_component, chance.bsdf, active
@@ -318,7 +222,7 @@ class PathsBehind(Backdrop):
             going &= chance.roulette < survival
             throughput /= dr.select(going, survival, 1)
         straight = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-        following = _Paths(
+        following = Paths(
             slot=paths.slot,
             o=ray.o,
             d=ray.d,
@@ -333,20 +237,18 @@ class PathsBehind(Backdrop):
 
     # ---------------------------------- Connections ----------------------------------
 
-    def _add_emitters(
-        self, connections: _Connections, slot: Any, jitter: Any, image: _Image
-    ) -> None:
+    def _add_emitters(self, connections: Connections, slot: Any, jitter: Any, image: Image) -> None:
         """Adds the light of emitters, weakened by the fields before them."""
         lit, rays, light = connections.take(jitter)
         if not len(lit):
             return
         if self._fields:
             light *= transmittance(self._fields, rays)
-        image.add(_gather(slot, lit), light)
+        image.add(gather(slot, lit), light)
         dr.eval(image)
 
     def _add_fields(
-        self, connections: _Connections | None, slot: Any, jitter: Any, image: _Image
+        self, connections: Connections | None, slot: Any, jitter: Any, image: Image
     ) -> None:
         """Adds the light of fields before the first surface."""
         if connections is None:
@@ -357,20 +259,15 @@ class PathsBehind(Backdrop):
         first = mi.Ray3f(rays.o, rays.d)
         rays.reach = self._scene.ray_intersect_preliminary(first, coherent=False).t
         dr.eval(rays.reach)
-        image.add(_gather(slot, lit), light * see(self._fields, rays).color)
+        image.add(gather(slot, lit), light * see(self._fields, rays).color)
         dr.eval(image)
 
-    def _chance(self, sampler: Any, slot: Any) -> _Chance:
+    def _chance(self, sampler: Any, slot: Any) -> Chance:
         """Draws for all R camera rays, so that the sampler keeps its order; N are kept."""
         one, two = sampler.next_1d, sampler.next_2d
         jitter = [one() for _ in range(3)] if self._settings.jitter else [None] * 3
         point = mi.Point3f(*two(), one())
-        chance = _Chance(two(), two(), one(), one(), one(), point, jitter)
+        chance = Chance(two(), two(), one(), one(), one(), point, jitter)
         sampler.schedule_state()
         dr.eval(chance)
         return chance.take(slot)
-
-
-def _gather(value: Any, index: Any) -> Any:
-    """Some entries of an array, a vector or a structure of them."""
-    return dr.gather(type(value), value, index)
