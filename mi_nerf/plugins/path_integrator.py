@@ -45,11 +45,30 @@ class NerfPathIntegrator(MarchingIntegrator):
      * - paths
        - |int|
        - Paths that go on behind the fields for every camera ray. (Default: 1)
-     * - samples, near, far, rule, stop, jitter, aovs
-       - |int|, |float|, |string|, |bool|
-       - As in :monosp:`nerf`. ``near`` and ``far``, and those of field files, are distances
-         along camera rays and do not bound other segments. A path ends where fields let less
-         than ``stop`` of it pass. ``aovs`` are those of camera rays. (Default: as there)
+     * - samples
+       - |int|
+       - Strata along each segment between entry and exit of a field's box.
+         (Default: what the field file suggests)
+     * - near, far
+       - |float|
+       - Fixed bounds of the distance along camera rays, in world units, within the boxes. Neither
+         these nor those of a field file bound other segments.
+         (Default: what the field file suggests)
+     * - rule
+       - |string|
+       - How density runs between samples, as in :monosp:`nerf`.
+         (Default: what the field file suggests)
+     * - stop
+       - |float|
+       - Paths end where fields let less than this share of them pass. 0 switches it off.
+         (Default: what the field file suggests, 1e-3 as trained)
+     * - jitter
+       - |bool|
+       - Shift the samples of every segment at random within their strata. (Default: true)
+     * - aovs
+       - |string|
+       - Extra channels of camera rays: ``depth``, ``opacity``, ``normal``, ``index``, as in
+         :monosp:`nerf`. (Default: none)
 
     Follows light paths among surfaces and lights, each segment of which passes the fields: they
     weaken it and add what they emit. So fields cast shadows, are seen in mirrors and through
