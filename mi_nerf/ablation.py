@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from .encoding import FourierEncoding
 from .errors import InputError
 from .evaluation import evaluate
-from .files import make_folder, read_json, replacing, write_json
+from .files import make_folder, replacing, write_json
 from .target import open_target
-from .training import run as training
-from .training.config import TrainConfig, from_json, to_json
-from .training.run import CONFIG, TrainingError
+from .training.config import TrainConfig, to_json
+from .training.run import Run
+from .trainings import check_same, mean, trained
 
 RECORD, TABLE, FIGURE = "ablation.json", "ablation.md", "ablation.png"
-EVALUATION = "eval.json"
 
 
 @dataclass(frozen=True)
@@ -130,9 +129,10 @@ def ablate(
         raise InputError("preset 'auto': decides what rows differ in, expected nerf, fast or paper")
     folder = Path(out)
     base = complete(config)
-    settings = {"data": str(Path(data).resolve()), "split": split, "views": views}
-    record = {"settings": {**settings, "base": to_json(base)}, "complete": False, "rows": []}
-    _check_same(folder, record)
+    settings: dict[str, Any] = {"data": str(Path(data).resolve()), "split": split, "views": views}
+    settings["base"] = to_json(base)
+    record = {"settings": settings, "complete": False, "rows": []}
+    check_same(folder, RECORD, settings, "an ablation")
     make_folder(folder)
     write_json(folder / RECORD, record)
     results: dict[str, list[dict[str, Any]]] = {name: [] for name in rows}
@@ -140,7 +140,9 @@ def ablate(
         for name in rows:
             wanted = replace(ROWS[name].change(base), seed=base.seed + seed)
             print(f"{name}, seed {wanted.seed}", flush=True)
-            result = _result(data, folder / name / f"seed_{wanted.seed}", wanted, variant, record)
+            place = folder / name / f"seed_{wanted.seed}"
+            measure = partial(_quality, settings=settings, variant=variant)
+            result = trained(data, place, wanted, variant, measure)
             if result is None:
                 return _write(folder, record, results)
             results[name].append(result)
@@ -148,53 +150,12 @@ def ablate(
     return _write(folder, record, results)
 
 
-def _check_same(folder: Path, record: dict[str, Any]) -> None:
-    if not (folder / RECORD).exists():
-        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(f"{folder}: holds no {RECORD}, expected a new or empty folder")
-        return
-    found = read_json(folder / RECORD, "the record of an ablation")
-    if not isinstance(found, dict) or found.get("settings") != record["settings"]:
-        raise InputError(
-            f"{folder / RECORD}: holds an ablation with other settings, expected another folder"
-        )
-
-
-def _result(
-    data: str | Path, folder: Path, config: TrainConfig, variant: str, record: dict[str, Any]
-) -> dict[str, Any] | None:
-    """Quality of one run, trained now or before; ``None`` if interrupted."""
-    if (folder / EVALUATION).exists():
-        found: dict[str, Any] = read_json(folder / EVALUATION, "the evaluation of a run")
-        return found
-    if (folder / CONFIG).exists():
-        recorded = read_json(folder / CONFIG, "the config.json of a run")["settings"]
-        config = from_json(recorded, str(folder / CONFIG))
-    run = training.start(data, folder, config, variant, resume=True)
-    try:
-        run.train()
-    except TrainingError as error:
-        result = {"failed": str(error), "restarts": run.trainer.attempt}
-        write_json(folder / EVALUATION, result)
-        return result
-    if run.progress < 1:
-        return None
-    options = record["settings"]
-    evaluation = evaluate(
-        open_target(folder), variant, split=options["split"], views=options["views"]
-    )
-    result = {
-        **evaluation["mean"],
-        "train_seconds": run.seconds,
-        "queries_per_ray": evaluation["queries_per_ray"],
-        "parameters": evaluation["parameters"],
-        "views": evaluation["views"],
-        "size": evaluation["size"],
-        "restarts": run.trainer.attempt,
-        "failed": None,
-    }
-    write_json(folder / EVALUATION, result)
-    return result
+def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]:
+    """What the table says of a finished run."""
+    target = open_target(run.folder)
+    found = evaluate(target, variant, split=settings["split"], views=settings["views"])
+    names = ("queries_per_ray", "parameters", "views", "size")
+    return {**found["mean"], "train_seconds": run.seconds, **{n: found[n] for n in names}}
 
 
 # ---- Table and figure --------------------------------------------------------
@@ -220,13 +181,8 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Means over the runs that did not fail."""
     good = [run for run in runs if run["failed"] is None]
     keys = ("psnr", "ssim", "train_seconds", "queries_per_ray", "parameters")
-    means = {key: _mean([run[key] for run in good]) for key in keys}
+    means = {key: mean(run[key] for run in good) for key in keys}
     return {**means, "seeds": len(runs), "failures": len(runs) - len(good)}
-
-
-def _mean(values: list[float | None]) -> float | None:
-    numbers = [value for value in values if value is not None]
-    return statistics.fmean(numbers) if numbers else None
 
 
 def table(record: dict[str, Any]) -> str:

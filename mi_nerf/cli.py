@@ -18,6 +18,8 @@ from .errors import InputError
 from .training.run import TrainingError
 from .usage import unknown_command, usage_error
 
+_LISTS = ("--set", "--vary")  # options that may be followed by several values
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs the command line; returns the exit status.
@@ -68,11 +70,12 @@ def _parse(arguments: list[str]) -> Any:
 def _spread_lists(arguments: list[str]) -> list[str]:
     """Turns ``--set a=1 b=2`` into ``--set a=1 --set b=2``; both may be written."""
     result: list[str] = []
-    inside = False
+    inside = None
     for argument in arguments:
-        if inside and not argument.startswith("-") and result[-1] != "--set":
-            result.append("--set")
-        inside = argument == "--set" or (inside and not argument.startswith("-"))
+        if argument.startswith("-"):
+            inside = argument if argument in _LISTS else None
+        elif inside is not None and result[-1] != inside:
+            result.append(inside)
         result.append(argument)
     return result
 

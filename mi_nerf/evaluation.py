@@ -52,7 +52,7 @@ def evaluate(
     Raises:
         InputError: if there is no dataset to compare with, or it cannot be read.
     """
-    dataset = _held_out(target, data, split, downscale, views)
+    dataset = held_out(target, data, split, downscale, views)
     folder = None if images is None else make_folder(images)
     backend = array_module(variant)
     field, occupancy = target.contents.build(backend)
@@ -113,13 +113,18 @@ def reference_image(dataset: Dataset, index: int) -> Image:
     return to_8bit(linear_to_srgb(image) if dataset.color_space == "linear" else image)
 
 
-def _held_out(
+def held_out(
     target: Target,
     data: str | Path | None,
     split: str,
     downscale: int | None,
     views: int | None,
 ) -> Dataset:
+    """The views that a target is measured on; ``data`` and ``downscale`` default to its own.
+
+    Raises:
+        InputError: if there are none, or they are not of the kind it was trained on.
+    """
     if views is not None and views < 1:
         raise InputError(f"--views {views}: expected at least 1")
     scale = target.downscale if downscale is None else downscale

@@ -20,11 +20,11 @@ from .arrays import vector3_type
 class HashGridConfig:
     """Resolutions and sizes of the levels."""
 
-    levels: int = 8
+    levels: int = 8  # resolutions
     features: int = 4  # a vertex of every level; four are gathered at once
     log2_entries: int = 16  # vertices that a level has memory for, at most 2 to this power
     coarsest: int = 16  # vertices along [−1, 1] at the first level
-    finest: int | None = None  # and at the last; none: as many as the images resolve
+    finest: int | None = None  # vertices at the last level; none: as many as the images resolve
 
     def __post_init__(self) -> None:
         for name, lowest, highest in (

@@ -20,7 +20,7 @@ its last half intervals. :func:`_roughness` carries all this on to what is seen.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -222,11 +222,12 @@ class _March:
         t = near[:, None] + place * h
         p = self._o[rays, None] + t[..., None] * self._d[rays, None]
         view = np.broadcast_to(self._view[rays, None], p.shape)
-        density, emission = self._query(p.reshape(-1, 3), view.reshape(-1, 3))
+        density, emission, asked = self._query(p.reshape(-1, 3), view.reshape(-1, 3))
+        emission = _spread(emission.reshape(*t.shape, 3), asked.reshape(t.shape))
         tau, ends = np.split(density.reshape(t.shape) * h, [intervals], axis=1)
-        channels = np.concatenate(
-            [emission.reshape(*t.shape, 3), (place * h)[..., None]], axis=-1
-        ).transpose(0, 2, 1)[..., :intervals]
+        channels = np.concatenate([emission, (place * h)[..., None]], axis=-1).transpose(0, 2, 1)[
+            ..., :intervals
+        ]
         total = np.cumsum(tau, axis=1)
         through = np.exp(-np.concatenate([0 * h, total], axis=1))  # at the ends of intervals
         weights = through[:, :-1] * -np.expm1(-tau)
@@ -245,26 +246,45 @@ class _March:
         depth = np.where(visible, near + mean, 0)
         return np.column_stack([moments[:, :3], opacity, depth]), *bounds
 
-    def _query(self, p: Array, view: Array) -> tuple[Array, Array]:
-        """σ and emitted colour at M points, (M,) and (M, 3), in blocks of constant size."""
-        density, emission = np.empty(len(p)), np.empty((len(p), 3))
-        for start in range(0, len(p), self._block):
-            stop = min(start + self._block, len(p))
-            pad = np.minimum(np.arange(start, start + self._block), stop - 1)
-            where, along = self._vectors(p[pad]), self._vectors(view[pad])
-            sigma, color = self._ask(where, along)
-            if self._occupancy is not None:
-                seen = self._occupancy.occupied(self._occupancy.cell(where))
-                sigma = dr.select(seen, sigma, 0)
+    def _query(self, p: Array, view: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """σ and emitted colour at M points, (M,) and (M, 3), and where the field was asked.
+
+        Elsewhere, in cells marked as empty, both are 0.
+        """
+        density, emission = np.zeros(len(p)), np.zeros((len(p), 3))
+        asked = np.ones(len(p), bool)
+        if self._occupancy is not None:
+            for part, pad in self._blocks(np.arange(len(p))):
+                seen = self._occupancy.occupied(self._occupancy.cell(self._vectors(p[pad])))
+                asked[part] = np.array(seen)[: len(part)]
+        for part, pad in self._blocks(np.flatnonzero(asked)):
+            sigma, color = self._ask(self._vectors(p[pad]), self._vectors(view[pad]))
             dr.eval(sigma, color)
-            n = stop - start
-            density[start:stop] = np.array(sigma)[:n]
+            density[part] = np.array(sigma)[: len(part)]
             for channel, values in zip(emission.T, color, strict=True):
-                channel[start:stop] = np.array(values)[:n]
-        return density, emission
+                channel[part] = np.array(values)[: len(part)]
+        return density, emission, asked
+
+    def _blocks(self, index: NDArray[np.int64]) -> Iterator[tuple[Any, Any]]:
+        """Parts of an index, and the same padded to a constant size."""
+        for start in range(0, len(index), self._block):
+            part = index[start : start + self._block]
+            yield part, np.pad(part, (0, self._block - len(part)), mode="edge")
 
     def _vectors(self, v: Array) -> Any:
         return vector3_type(self._float)(*(upload(self._float, row) for row in v.T))
+
+
+def _spread(emission: Array, asked: NDArray[np.bool_]) -> Array:
+    """Colours of (R, S) samples, those not asked for as at the last one that was, if any.
+
+    Where nothing is emitted any colour is right, and the least change of it the best.
+    """
+    if asked.all():
+        return emission
+    last = np.maximum.accumulate(np.where(asked, np.arange(asked.shape[1]), -1), axis=1)
+    last = np.where(last < 0, np.argmax(asked, axis=1)[:, None], last)
+    return np.take_along_axis(emission, last[..., None], axis=1)
 
 
 def _roughness(

@@ -14,12 +14,12 @@ import numpy as np
 from .backend import array_module
 from .cameras import Intrinsics
 from .color import srgb_to_linear
-from .data import Dataset, available_splits, load_dataset
+from .data import Dataset, held_out_split, load_dataset
 from .errors import InputError
 from .files import check_file, check_folder, make_folder, replacing
 from .images import on_white, write_picture
 from .scene_file import load_scene
-from .target import Target
+from .target import Target, open_target
 from .trajectory import Poses, forward_spiral, orbit_like, spiral_like
 from .views import render_view
 
@@ -30,6 +30,54 @@ Frames = Iterator[tuple[str, Image]]  # name and (H, W, 4) linear premultiplied 
 Output = Literal["picture", "video", "folder"]
 
 _KINDS: dict[str, Output] = {"": "folder", ".png": "picture", ".exr": "picture", ".mp4": "video"}
+
+
+def frames_of(
+    source: str | Path | Target,
+    variant: str,
+    *,
+    path: Path_ | None = None,
+    frames: int | None = None,
+    still: bool = False,
+    size: tuple[int, int] | None = None,
+    spp: int | None = None,
+) -> tuple[int, Frames]:
+    """Renders a run along a camera path, or a Mitsuba XML scene.
+
+    Args:
+        path: default: the run's (:func:`default_path`), or the scene's own sensors.
+        frames: along the path; default: 60, or all test views; with ``still``, one.
+        size: width and height; default: those of the run's images or the scene's film.
+        spp: samples a pixel; default: 1 for runs, the scene's own for XML.
+
+    Returns:
+        The number of frames and an iterator over them.
+
+    Raises:
+        InputError: if there is neither, or what was asked for does not suit it.
+    """
+    if not isinstance(source, Target):
+        source = Path(source)
+        if not source.exists():
+            raise InputError(f"{source}: not found, expected a run folder or a Mitsuba XML scene")
+        if source.suffix.lower() == ".xml":
+            if frames is not None and path is None:
+                raise InputError(
+                    f"--frames {frames}: the sensors of a scene give one frame each, "
+                    "expected --path orbit or --path spiral too"
+                )
+            return scene_frames(
+                source,
+                variant,
+                path=path,
+                frames=frames or (1 if still else 60),
+                size=size,
+                spp=spp or 0,
+            )
+        source = open_target(source)
+    path = path or default_path(source)
+    usual = 1 if still else (0 if path == "test" else 60)
+    return run_frames(source, variant, path=path, frames=frames or usual, size=size, spp=spp or 1)
 
 
 def run_frames(
@@ -201,10 +249,9 @@ def _cameras(target: Target, path: Path_) -> Dataset:
     assert target.data is not None
     if path != "test":
         return load_dataset(target.data, "train", downscale=target.downscale)
-    splits = [s for s in available_splits(target.data) if s != "train"]
-    if not splits:
+    split = held_out_split(target.data)
+    if split is None:
         raise InputError(f"{target.data}: has no test views, expected --path orbit or spiral")
-    split = "test" if "test" in splits else splits[0]
     return load_dataset(target.data, split, downscale=target.downscale)
 
 

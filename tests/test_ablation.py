@@ -91,7 +91,7 @@ def test_it_goes_on_where_it_was_stopped(
     started: list[str] = []
     train = Run.train
 
-    def stopping(self: Run, show_bar: bool = True) -> None:
+    def stopping(self: Run, show_bar: bool = True, after_step: object = None) -> None:
         started.append(self.folder.parent.name)
         if len(started) == 2:
             self._advance()
@@ -112,7 +112,7 @@ def test_it_goes_on_where_it_was_stopped(
 
 
 def test_failures_are_counted(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def failing(self: Run, show_bar: bool = True) -> None:
+    def failing(self: Run, show_bar: bool = True, after_step: object = None) -> None:
         raise TrainingError("collapsed")
 
     monkeypatch.setattr(Run, "train", failing)

@@ -298,6 +298,26 @@ def test_spiral_is_the_path_of_forward_runs(
     assert "expected --path spiral or --path test" in message
 
 
+def test_report_of_a_capture(
+    forward_run: Path, capture: Path, tmp_path: Path, refused: Callable[..., str]
+) -> None:
+    """Held-out views, depths in scene units; a field file alone does not know its cameras."""
+    options = ["--rays", "200", "--repeats", "1", "--samples", "8", "128", "--no-profile"]
+    options += ["--resolutions", "--thresholds", "--stops"]
+    assert main(["report", str(forward_run), "--out", str(tmp_path / "out"), *options]) == 0
+    speed = json.loads((tmp_path / "out/report.json").read_text())["speed"]
+    assert speed["views"]["split"] == "test" and speed["views"]["data"] == str(capture)
+    rough, fine = (
+        next(p for p in speed["points"] if (p["samples"], p["rule"]) == (n, "constant"))
+        for n in (8, 128)
+    )
+    for name in ("color", "depth"):  # second order: 256 times
+        assert 0 < fine["error"][name] < 0.1 * rough["error"][name]
+    assert "expected --data" in refused(
+        "report", forward_run / "field.safetensors", "--out", tmp_path / "none"
+    )
+
+
 def test_captures_that_look_around_are_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
     images = np.zeros((8, 8, 8, 3), np.uint8)
     folder = write_llff_dataset(tmp_path / "around", images, orbit_poses(8), 8.0)

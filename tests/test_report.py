@@ -120,7 +120,7 @@ def test_deviation_measures_view_dependence(tmp_path: Path) -> None:
 
 def test_the_command(blob_run: Path, tmp_path: Path) -> None:
     points = ["--point", "0.1", "0.2", "0.3", "--point", "-0.2", "0", "0.1"]
-    out = ["--out", str(tmp_path / "out"), "--no-profile"]
+    out = ["--out", str(tmp_path / "out"), "--no-profile", "--no-speed"]
     assert main(["report", str(blob_run), *out, *points]) == 0
     record = json.loads((tmp_path / "out/report.json").read_text())
     found = [entry["point"] for entry in record["view_dependence"]]
@@ -136,9 +136,8 @@ def test_steps_of_a_run_are_measured_and_the_run_stays_as_it_is(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {path: path.read_bytes() for path in run.iterdir()}
-    assert (
-        main(["report", str(run), "--out", str(tmp_path / "out"), "--point", "0", "0", "0.4"]) == 0
-    )
+    point = ["--point", "0", "0", "0.4"]
+    assert main(["report", str(run), "--out", str(tmp_path / "out"), "--no-speed", *point]) == 0
     assert {path: path.read_bytes() for path in run.iterdir()} == before
     step = json.loads((tmp_path / "out/report.json").read_text())["step"]
     assert sum(step["stages"].values()) == pytest.approx(step["step_ms"])
@@ -154,7 +153,7 @@ def test_steps_of_a_run_are_measured_and_the_run_stays_as_it_is(
 def test_without_a_readable_checkpoint_the_profile_is_left_out(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    point = ["--point", "0", "0", "0.4"]
+    point = ["--point", "0", "0", "0.4", "--no-speed"]
     (run / "checkpoint.safetensors").write_bytes(b"damaged")
     for target, reason in (
         (run, f"{run / 'checkpoint.safetensors'}: "),
@@ -175,7 +174,7 @@ def test_a_run_whose_data_is_gone(
     (run / "config.json").write_text(json.dumps(config))
     out = tmp_path / "out"
     assert f"{gone}: no such dataset folder" in refused("report", run, "--out", out)
-    assert main(["report", str(run), "--out", str(out), "--point", "0", "0", "0.4"]) == 0
+    assert main(["report", str(run), "--out", str(out), "--no-speed"]) == 0
     reason = f"{gone}: no such dataset folder"
     assert f"no profile of training steps: {reason}" in capsys.readouterr().out
     assert f"Left out: {reason}." in (out / "report.md").read_text()
@@ -185,5 +184,5 @@ def test_bad_input(refused: Callable[..., str], run: Path, tmp_path: Path) -> No
     out = tmp_path / "out"
     line = refused("report", run, "--out", out, "--point", "9", "0", "0")
     assert "--point 9.0 0.0 0.0: outside the field's box" in line
-    line = refused("report", run / "field.safetensors", "--out", out)
-    assert "expected --point" in line
+    line = refused("report", run, "--out", out, "--point", "9", "0", "0", "--no-speed")
+    assert "outside the field's box" in line

@@ -36,12 +36,19 @@ BOX = ((-1.0, -1.0, -1.0), (1.0, 1.0, 1.0))
 
 
 def estimates(
-    ad: Any, field: Any, o: np.ndarray, d: np.ndarray, majorants: Any, paths: int, **options: Any
+    ad: Any,
+    field: Any,
+    o: np.ndarray,
+    d: np.ndarray,
+    majorants: Any,
+    paths: int,
+    seed: int = 5,
+    **options: Any,
 ) -> tuple[np.ndarray, Tracked]:
     """Colour and opacity of ``paths`` walks along each of R rays: (4, R, paths)."""
     o, d = (vectors(ad, np.repeat(v, paths, axis=0)) for v in (o, d))
     rays = len(o[0])
-    state = np.random.default_rng(5).integers(0, 1 << 63, rays, np.uint64)
+    state = np.random.default_rng(seed).integers(0, 1 << 63, rays, np.uint64)
     random = ad.PCG32(initstate=ad.UInt64(state), initseq=dr.arange(ad.UInt64, rays))
     seen = track(field, ray_segments(field, o, d), majorants, random, **options)
     values = np.array([*map(np.array, seen.color), np.array(seen.opacity)], float)

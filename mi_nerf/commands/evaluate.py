@@ -9,9 +9,9 @@ from typing import Annotated, Any
 from tyro.conf import Positional, arg
 
 from ..backend import choose_variant
-from ..evaluation import evaluate, quality
+from ..evaluation import quality
 from ..files import check_file, check_folder, make_folder, write_json
-from ..target import open_target
+from ..workflow import evaluate
 from .shared import Variant, progress_bar
 
 
@@ -58,13 +58,13 @@ class Eval:
             check_folder(self.images)
         with bar:
             record = evaluate(
-                open_target(self.target),
-                choose_variant(self.variant),
+                self.target,
                 data=self.data,
                 split=self.split,
                 downscale=self.downscale,
                 views=self.views,
                 images=self.images,
+                variant=choose_variant(self.variant),
                 on_image=show,
             )
         if self.json is not None:

@@ -9,10 +9,10 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..backend import choose_variant
-from ..generation import Options, generate
+from ..generation import Options
 from ..generation.run import summary
-from ..scene_library import find_scene
-from .shared import Variant, name_and_value, valid_seed
+from ..workflow import generate
+from .shared import Variant, name_and_value
 
 
 @dataclass(frozen=True)
@@ -64,16 +64,14 @@ class Generate:
 
     def run(self, _started: float) -> None:
         """Generates."""
-        names = [field.name for field in fields(Options)]
-        options = Options(**{name: getattr(self, name) for name in names})
-        valid_seed(self.seed)
+        options = {field.name: getattr(self, field.name) for field in fields(Options)}
         record = generate(
-            find_scene(self.scene),
+            self.scene,
             self.out,
-            choose_variant(self.variant),
-            options,
+            **options,
             parameters=dict(name_and_value(text) for text in self.set),
             resume=self.resume,
+            variant=choose_variant(self.variant),
         )
         print(f"{self.out}: {summary(record)}")
         if not record["complete"]:

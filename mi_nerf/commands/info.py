@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from .. import info
+from ..workflow import describe
 
 
 @dataclass(frozen=True)
@@ -27,4 +27,4 @@ class Info:
 
     def run(self, _started: float) -> None:
         """Prints a summary."""
-        print(info.system() if self.target is None else info.describe(self.target))
+        print(describe(self.target))

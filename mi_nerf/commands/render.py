@@ -10,16 +10,8 @@ from tyro.conf import Positional, arg
 
 from ..backend import choose_variant
 from ..errors import InputError
-from ..rendering import (
-    check_output,
-    default_path,
-    output_kind,
-    run_frames,
-    scene_frames,
-    write_frames,
-)
+from ..rendering import check_output, frames_of, output_kind, write_frames
 from ..scene_library import scenes
-from ..target import open_target
 from .shared import Variant, positive, progress_bar
 
 
@@ -62,49 +54,20 @@ class Render:
             raise InputError(
                 f"--size {self.size[0]} {self.size[1]}: expected two numbers of at least 1"
             )
-        place = self._target()
-        picture = output_kind(self.out) == "picture"
         check_output(self.out, self.frames or 1)
-        variant = choose_variant(self.variant)
-        if place.suffix.lower() == ".xml":
-            if self.frames is not None and self.path is None:
-                raise InputError(
-                    f"--frames {self.frames}: the sensors of a scene give one frame each, "
-                    "expected --path orbit or --path spiral too"
-                )
-            frames = 1 if picture else 60
-            count, images = scene_frames(
-                place,
-                variant,
-                path=self.path,
-                frames=self.frames or frames,
-                size=self.size,
-                spp=self.spp or 0,
-            )
-        else:
-            target = open_target(place)
-            path = self.path or default_path(target)
-            frames = 1 if picture else (0 if path == "test" else 60)
-            count, images = run_frames(
-                target,
-                variant,
-                path=path,
-                frames=self.frames or frames,
-                size=self.size,
-                spp=self.spp or 1,
-            )
+        count, images = frames_of(
+            self._target(),
+            choose_variant(self.variant),
+            path=self.path,
+            frames=self.frames,
+            still=output_kind(self.out) == "picture",
+            size=self.size,
+            spp=self.spp,
+        )
         with progress_bar("render", "frame", count) as bar:
             write_frames(self.out, count, images, on_frame=bar.update)
         print(f"{self.out}: {count} frame{'s' if count != 1 else ''}")
 
     def _target(self) -> Path:
-        """What to render: something at a path, or else a scene by name."""
-        if self.target.exists():
-            return self.target
-        found = scenes().get(str(self.target))
-        if found is None:
-            raise InputError(
-                f"{self.target}: not found, expected a run folder or a Mitsuba XML scene, or "
-                "the name of one that comes with mi_nerf"
-            )
-        return found
+        """What lies at the path, or else the scene of that name."""
+        return self.target if self.target.exists() else scenes().get(str(self.target), self.target)

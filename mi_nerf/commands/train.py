@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..backend import choose_variant
-from ..errors import InputError
-from ..training import run as training
-from ..training.config import with_settings
-from ..training.presets import preset
-from .shared import Variant, positive, valid_seed
+from ..workflow import start
+from .shared import Variant
 
 
 @dataclass(frozen=True)
@@ -55,27 +52,18 @@ class Train:
 
     def run(self, started: float) -> None:
         """Trains."""
-        config = preset(self.preset)
-        config = replace(
-            config, seed=valid_seed(self.seed), downscale=positive("downscale", self.downscale)
-        )
-        config = with_settings(config, list(self.set))
-        limits = {"steps": self.steps, "max_seconds": self.max_seconds}
-        for name, value in limits.items():
-            if value is not None:
-                config = replace(config, **{name: positive(name.replace("_", "-"), value)})
-        if not self.resume and config.steps is None and config.max_seconds is None:
-            config = replace(config, max_seconds=600.0)
-        if self.resume and (self.out / training.CONFIG).exists():
-            self._require_same_settings()
-        run = training.start(
+        run = start(
             self.data,
             self.out,
-            config,
-            choose_variant(self.variant),
+            preset=self.preset,
+            max_seconds=self.max_seconds,
+            steps=self.steps,
+            downscale=self.downscale,
+            seed=self.seed,
+            settings=self.set,
             resume=self.resume,
+            variant=choose_variant(self.variant),
             started=started,
-            given={assignment.partition("=")[0] for assignment in self.set},
         )
         for decision in run.decisions:
             print(f"auto: {decision}")
@@ -83,17 +71,3 @@ class Train:
         trainer = run.trainer
         hint = "" if run.progress >= 1 else "; stopped early, go on with --resume"
         print(f"{self.out}: {trainer.step_count} steps in {run.seconds:.0f} s{hint}")
-
-    def _require_same_settings(self) -> None:
-        """Refuses options that a resumed run, which keeps its settings, would ignore."""
-        recorded, _ = training.read_config(self.out)
-        wanted = with_settings(recorded, list(self.set))
-        for name, default in (("preset", "nerf"), ("seed", 0), ("downscale", 1)):
-            if getattr(self, name) != default:
-                wanted = replace(wanted, **{name: getattr(self, name)})
-        wanted = replace(wanted, steps=recorded.steps, max_seconds=recorded.max_seconds)
-        if wanted != recorded:
-            raise InputError(
-                f"{self.out}: a resumed run keeps its settings, expected no other --preset, "
-                "--seed, --downscale or --set than it was started with"
-            )

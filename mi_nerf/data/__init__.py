@@ -21,6 +21,7 @@ __all__ = [
     "Progress",
     "available_splits",
     "evenly_spread_indices",
+    "held_out_split",
     "load_dataset",
 ]
 
@@ -73,6 +74,16 @@ def available_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
             f"{folder}: expected a dataset with transforms_{{train,val,test}}.json or {llff.POSES}"
         )
     return splits
+
+
+def held_out_split(path: str | os.PathLike[str]) -> str | None:
+    """The split to measure on: test, or the first one beside train; ``None`` if there is none.
+
+    Raises:
+        InputError: The folder does not exist or is no dataset.
+    """
+    splits = [s for s in available_splits(path) if s != "train"]
+    return "test" if "test" in splits else next(iter(splits), None)
 
 
 def _existing_folder(path: str | os.PathLike[str]) -> Path:

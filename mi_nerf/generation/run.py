@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import platform
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm.auto import tqdm
 
 from .. import __version__
+from ..bars import bars_are_seen, progress_bar
 from ..errors import InputError
 from ..files import check_folder, make_folder, read_json, write_json
 from ..interrupts import interruptible
@@ -299,11 +298,8 @@ class _Progress:
     """A bar with the time left on a terminal, a quiet line now and then elsewhere."""
 
     def __init__(self, total: int, done: int, show: bool) -> None:
-        terminal = show and sys.stderr.isatty()
-        self._lines = show and not terminal
-        self._bar = tqdm(
-            total=total, initial=done, desc="generate", unit="view", disable=not terminal
-        )
+        self._lines = show and not bars_are_seen()
+        self._bar = progress_bar("generate", "view", total, show=show, initial=done)
         self._total, self._done, self._last = total, done, time.monotonic()
 
     def __enter__(self) -> _Progress:

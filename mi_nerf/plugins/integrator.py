@@ -24,7 +24,7 @@ class NerfIntegrator(MarchingIntegrator):
 
     .. pluginparameters::
 
-     * - (nested plugin)
+     * - (Nested plugin)
        - |integrator|
        - What shows surfaces and lights, such as :monosp:`path` or :monosp:`prb`: any integrator
          that returns the radiance along a ray. Without one, the scene's surfaces are left out,

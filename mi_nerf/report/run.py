@@ -1,81 +1,157 @@
-"""``mi-nerf report``: a folder of tables and plots about one target."""
+"""``mi-nerf report``: a folder of tables and plots about one target, or about trainings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..backend import array_module
 from ..data import load_dataset
 from ..errors import InputError
-from ..field import Field
-from ..files import make_folder, replacing, write_json
-from ..occupancy import OccupancyGrid
-from ..target import Target
+from ..files import check_folder, make_folder, read_json, replacing, write_json
+from ..machine import machine
+from ..target import Target, open_target
+from ..training.config import TrainConfig
+from . import curves_text, speed_text
 from . import profile as step_profile
-from .view_dependence import draw_view_dependence, field_position, find_points
+from .curves import RECORD, training_curves
+from .speed import Knobs, sweep
+from .speed_plot import plot_speed
+from .subject import Subject, open_field, open_subject
+from .view_dependence import draw_view_dependence, field_position, find_points, surface_normal
 
 Point = tuple[float, float, float]
 
-FIGURE = "view_dependence.png"
+TEXT = "report.md"
+FIGURE, SPEED_FIGURE, CURVES_FIGURE = "view_dependence.png", "speed.png", "training.png"
 
 
 def report(
-    target: Target,
+    target: Target | str | Path,
     out: str | Path,
     variant: str,
     points: Sequence[Point] = (),
     *,
+    knobs: Knobs | None = None,
+    repeats: int = 7,
     profile: bool = True,
+    values: Mapping[str, Any] | None = None,
+    data: str | Path | None = None,
     on_step: Callable[[], object] | None = None,
+    on_render: Callable[[int], object] | None = None,
+    **rays: Any,
 ) -> dict[str, Any]:
     """Writes ``report.json``, ``report.md`` and their plots.
 
     Args:
+        target: a run folder, a field file or the name of a formula.
         points: where to look at the emission over directions; without any, places that the
             run's training cameras see.
+        knobs, repeats: what :func:`mi_nerf.report.sweep` tries; without knobs, speed and error
+            are left out.
         profile: measure training steps; left out, with the reason, where that is impossible.
+        values: parameters of a formula.
+        data: the dataset, if it is not that of the run.
         on_step: called after every training step.
+        on_render: called after every rendering of the sweep with their number in all.
+        rays: further arguments of :func:`mi_nerf.report.open_subject`.
 
     Returns:
-        What ``report.json`` holds.
+        What ``report.json`` holds: ``conclusions``, ``speed`` (of :func:`sweep`),
+        ``view_dependence``, ``step``, and for each why it was left out, if it was.
 
     Raises:
-        InputError: if a point lies outside the field or where it is even.
+        InputError: if the target or its images cannot be read, a point lies outside the field
+            or where it is even, or ``out`` cannot be written.
     """
-    field, occupancy = target.contents.build(array_module(variant))
-    chosen = _places(target, field, occupancy, points, variant)
+    check_folder(out)
+    subject = open_field(target, variant, values=values)
+    seen = None
+    if knobs is not None:
+        seen = open_subject(target, variant, values=values, data=data, **rays)
+    opened = None
+    if not subject.formula:
+        opened = target if isinstance(target, Target) else open_target(target)
+    places, no_places = _places(opened, subject, points, data)
+    speed = None
+    if seen is not None:
+        speed = sweep(seen, knobs, repeats=repeats, on_render=on_render)
     folder = make_folder(out)
     record: dict[str, Any] = {
-        "target": str(target.path),
+        "target": subject.name,
         "variant": variant,
-        "view_dependence": draw_view_dependence(folder / FIGURE, field, chosen, variant),
+        "machine": machine(variant),
+        "conclusions": [] if speed is None else speed_text.conclusions(speed),
+        "speed": speed,
+        "speed_left_out": None if knobs is not None else "not asked for",
+        "view_dependence": [],
+        "view_dependence_left_out": no_places,
         "step": None,
         "step_left_out": None if profile else "not asked for",
     }
+    if speed is not None:
+        _save(plot_speed(speed), folder / SPEED_FIGURE)
+    if places is not None:
+        record["view_dependence"] = draw_view_dependence(
+            folder / FIGURE, subject.field, places, variant
+        )
     if profile:
         try:
-            record["step"] = step_profile.profile_run(target, variant, on_step)
+            record["step"] = _profile(opened, subject, variant, on_step)
             step_profile.draw(folder / step_profile.FIGURE, record["step"])
         except InputError as error:
             record["step_left_out"] = str(error)
-    write_json(folder / "report.json", record)
-    with replacing(folder / "report.md") as temporary:
-        temporary.write_text(_markdown(record))
+    write_json(folder / RECORD, record)
+    _write(folder / TEXT, _markdown(record))
     return record
 
 
+def report_training(
+    data: str | Path, out: str | Path, rows: Mapping[str, TrainConfig], variant: str, **options: Any
+) -> dict[str, Any]:
+    """The same for trainings: :func:`mi_nerf.report.training_curves`, its table and its plot.
+
+    Raises:
+        InputError: as that does.
+    """
+    record = training_curves(data, out, rows, variant, **options)
+    folder = Path(out)
+    _save(curves_text.plot_curves(record), folder / CURVES_FIGURE)
+    _write(folder / TEXT, curves_text.markdown(record, CURVES_FIGURE))
+    return record
+
+
+def load(folder: str | Path) -> dict[str, Any]:
+    """The record that ``mi-nerf report`` has written to a folder.
+
+    Of a target it has ``speed``, as :func:`mi_nerf.report.sweep` gives it; of trainings it is
+    what :func:`mi_nerf.report.training_curves` gives.
+
+    Raises:
+        InputError: if there is none.
+    """
+    path = Path(folder) / RECORD
+    record = read_json(path, "the record of a report")
+    if not isinstance(record, dict) or not ("speed" in record or "rows" in record):
+        raise InputError(f"{path}: expected the record of a report")
+    return record
+
+
+def _profile(
+    target: Target | None, subject: Subject, variant: str, on_step: Callable[[], object] | None
+) -> dict[str, Any]:
+    if target is None:
+        raise InputError(f"{subject.name}: a formula, which is not trained")
+    return step_profile.profile_run(target, variant, on_step)
+
+
 def _places(
-    target: Target,
-    field: Field,
-    occupancy: OccupancyGrid | None,
-    points: Sequence[Point],
-    variant: str,
-) -> np.ndarray[Any, Any]:
-    """``points``, if they are in the field; without any, some that cameras see."""
+    target: Target | None, subject: Subject, points: Sequence[Point], data: str | Path | None
+) -> tuple[np.ndarray[Any, Any] | None, str | None]:
+    """``points``, if they are in the field; without any, some that cameras see, or why not."""
+    field = subject.field
     for point in points:
         place = field_position(field, np.array(point, np.float64)[:, None])[:, 0]
         if not (np.array(field.lower) <= place).all() or not (place <= field.upper).all():
@@ -83,21 +159,58 @@ def _places(
                 f"--point {' '.join(map(str, point))}: outside the field's box "
                 f"{field.lower} to {field.upper}"
             )
+        surface_normal(field, point, subject.backend)  # there is one
     if len(points):
-        return np.array(points, np.float64)
-    if target.data is None:
-        raise InputError(f"{target.path}: a field file knows no cameras, expected --point")
-    views = load_dataset(target.data, "train", downscale=target.downscale)
-    camera, poses, march = views.intrinsics, views.cam_to_world, target.contents.march
-    return find_points(field, occupancy, camera, poses, march, array_module(variant))
+        return np.array(points, np.float64), None
+    folder = data if data is not None or target is None else target.data
+    if target is None or folder is None:
+        kind = "a formula" if target is None else "a field file, which knows no cameras"
+        return None, f"{subject.name} is {kind}: --point says where to look"
+    try:
+        views = load_dataset(folder, "train", downscale=target.downscale)
+        camera, poses, march = views.intrinsics, views.cam_to_world, subject.march
+        found = find_points(field, subject.occupancy, camera, poses, march, subject.backend)
+    except InputError as error:
+        return None, str(error)
+    return found, None
 
 
-def _markdown(record: dict[str, Any]) -> str:
+def _save(figure: Any, path: Path) -> None:
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=150)
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    with replacing(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
+
+
+# ---- report.md -------------------------------------------------------------------
+
+
+def _markdown(record: dict[str, Any]) -> list[str]:
+    lines = [f"# Report on {record['target']}", ""]
+    lines += [f"- {sentence}" for sentence in record["conclusions"]]
+    lines += ["", "## Speed against error", ""]
+    if record["speed"] is None:
+        lines.append(f"Left out: {record['speed_left_out']}.")
+    else:
+        lines += speed_text.markdown(record["speed"], SPEED_FIGURE)
+    lines += ["", "## View dependence", ""]
+    if record["view_dependence"]:
+        lines += _view_dependence(record["view_dependence"])
+    else:
+        lines.append(f"Left out: {record['view_dependence_left_out']}.")
+    lines += ["", "## Where a step's time goes", ""]
+    if record["step"] is None:
+        lines.append(f"Left out: {record['step_left_out']}.")
+    else:
+        lines += step_profile.markdown(record["step"])
+    return lines
+
+
+def _view_dependence(entries: list[dict[str, Any]]) -> list[str]:
     lines = [
-        f"# Report on {record['target']}",
-        "",
-        "## View dependence",
-        "",
         "Colour that leaves a point towards every direction of the hemisphere around its normal,",
         "seen from above (NeRF, Fig. 3). The deviation is the root mean square over directions of",
         "display values; 0 means that the point looks the same from everywhere.",
@@ -107,12 +220,7 @@ def _markdown(record: dict[str, Any]) -> str:
         "| point | normal | mean colour | deviation |",
         "|---|---|---|---|",
     ]
-    for entry in record["view_dependence"]:
+    for entry in entries:
         cells = [", ".join(f"{v:.2f}" for v in entry[k]) for k in ("point", "normal", "color")]
         lines.append(f"| {' | '.join(cells)} | {entry['deviation']:.3f} |")
-    lines += ["", "## Where a step's time goes", ""]
-    if record["step"] is None:
-        lines.append(f"Left out: {record['step_left_out']}.")
-    else:
-        lines += step_profile.markdown(record["step"])
-    return "\n".join(lines) + "\n"
+    return lines

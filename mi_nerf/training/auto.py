@@ -29,6 +29,7 @@ from typing import Any
 from ..data import Dataset
 from . import probes
 from .config import TrainConfig, to_json, with_settings
+from .plain import as_text
 from .presets import nerf, preset
 from .probes import Probe, Probes
 from .trainer import Trainer, carved_cells, field_config, resolved_octaves
@@ -53,7 +54,7 @@ class Decision:
     reason: str
 
     def __str__(self) -> str:
-        return f"{self.setting} = {_text(self.value, '.4g')}: {self.reason}"
+        return f"{self.setting} = {as_text(self.value, '.4g')}: {self.reason}"
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class _Settings:
     def take(self, setting: str, value: Any, reason: str) -> None:
         """Settles one setting, unless the user has."""
         if self.open(setting):
-            self.config = with_settings(self.config, [f"{setting}={_text(value)}"])
+            self.config = with_settings(self.config, [f"{setting}={as_text(value)}"])
             self.decisions.append(Decision(setting, value, reason))
 
     def leave(self, reason: str) -> None:
@@ -307,15 +308,6 @@ def _shape(depth: int, width: int) -> list[str]:
 
 def _report(shape: tuple[int, int], probe: Probe) -> str:
     return f"{shape[0]}x{shape[1]}: {probe.quality:.2f} dB at {1e3 * probe.seconds:.1f} ms a step"
-
-
-def _text(value: Any, form: str = "") -> str:
-    """A value as ``--set`` takes it; ``form`` is how floating-point numbers are written."""
-    if isinstance(value, list):
-        return ",".join(_text(v, form) for v in value)
-    if isinstance(value, float):
-        return format(value, form)
-    return "none" if value is None else str(value).lower()
 
 
 def _changed(config: TrainConfig) -> set[str]:

@@ -21,7 +21,7 @@ from .plain import assign, build, leaf_names, require
 class DensityConfig:
     """How raw network outputs become densities."""
 
-    activation: DensityActivation = "softplus"
+    activation: DensityActivation = "softplus"  # of raw densities
     shift: float = -1.0  # added before the activation (softplus(x − 1): mip-NeRF)
     gain: float = 1.0  # density of activation output 1, per half side of the box
     noise: float = 0.0  # of N(0, 1) added to raw densities in training; images without alpha only
@@ -35,7 +35,7 @@ class DensityConfig:
 class OccupancyConfig:
     """The grid that spares the field's evaluation in empty space."""
 
-    enabled: bool = True
+    enabled: bool = True  # false: samples are evaluated everywhere in the box
     hull: bool = True  # start from the silhouettes, where images have alpha
     resolution: int = 64  # cells along the longest side of the box
     threshold: float = 0.01  # optical thickness of a cell below which it counts as empty
@@ -63,8 +63,8 @@ class SamplingConfig:
     render_stop: float = 1e-3  # transmittance at which a ray ends in evaluation; 0: never
     rays: int | None = None  # rays a step; none: as many as fill the batch
     rule: Rule = "constant"  # of quadrature, in training and evaluation
-    near: float | None = None  # fixed bounds instead of the box alone, scene units
-    far: float | None = None
+    near: float | None = None  # least distance of samples, scene units; none: the box alone
+    far: float | None = None  # largest distance of samples, scene units; none: the box alone
     block: int = 16384  # queries the network evaluates at a time
     hidden: float = 0.0  # training leaves out samples behind this optical depth; 0: none
 
@@ -88,9 +88,9 @@ class OptimizerConfig:
     lr: float = 5e-4  # learning rate after warm-up
     lr_final: float = 5e-5  # learning rate at the end of the schedule
     warmup: int = 100  # steps of linear increase
-    beta1: float = 0.9
-    beta2: float = 0.99
-    epsilon: float = 1e-8
+    beta1: float = 0.9  # decay of the mean gradient
+    beta2: float = 0.99  # decay of the mean squared gradient
+    epsilon: float = 1e-8  # added to the root of the latter
 
     def __post_init__(self) -> None:
         require(self, "lr lr_final epsilon", above=0)
@@ -106,16 +106,16 @@ class TrainConfig:
     normalised device coordinates.
     """
 
-    preset: str = "nerf"
-    seed: int = 0
+    preset: str = "nerf"  # where the other settings come from
+    seed: int = 0  # of initial weights, rays and samples
     steps: int | None = None  # stop after so many steps
     max_seconds: float | None = None  # stop after so much wall-clock time
     downscale: int = 1  # images are averaged over blocks of K×K pixels
     views: int | None = None  # train on so many views, evenly spread; none: all
     box: tuple[float, float, float, float, float, float] | None = None  # min, max; none: found
-    background: Literal["auto", "white", "black", "random"] = "auto"
-    loss: Literal["auto", "mse", "relative"] = "auto"
-    color_activation: Literal["auto"] | ColorActivation = "auto"
+    background: Literal["auto", "white", "black", "random"] = "auto"  # auto: random with alpha
+    loss: Literal["auto", "mse", "relative"] = "auto"  # auto: relative for linear images
+    color_activation: Literal["auto"] | ColorActivation = "auto"  # auto: exp for linear images
     network: NetworkConfig = field(default_factory=NetworkConfig)
     position: FourierEncoding | None = None  # none: as many octaves as the images resolve
     grid: HashGridConfig | None = None  # features of a hash grid, besides those of position
@@ -127,9 +127,9 @@ class TrainConfig:
     report_every: float = 2.0  # seconds between lines of the log
     checkpoint_every: float = 60.0  # seconds between checkpoints
     collapse_check: int = 400  # steps after which a run that learnt nothing restarts
-    max_restarts: int = 3
-    crop_steps: int = 0  # so many first steps see only the middle of the images,
-    crop: float = 0.5  # this share of their width and height
+    max_restarts: int = 3  # after a collapse, each with other weights
+    crop_steps: int = 0  # so many first steps see only the middle of the images
+    crop: float = 0.5  # share of width and height that they see
     max_skipped: int = 20  # non-finite steps in a row that end the run
     store_activations: float = 3.0  # GiB of activations; larger steps are taken in parts
 

@@ -80,6 +80,15 @@ def assign(values: dict[str, Any], cls: Any, path: list[str], text: str) -> None
         values[name] = _parse(text, hint)
 
 
+def as_text(value: Any, form: str = "") -> str:
+    """A plain value as :func:`assign` reads it; ``form`` is how real numbers are written."""
+    if isinstance(value, list | tuple):
+        return ",".join(as_text(v, form) for v in value)
+    if isinstance(value, float):
+        return format(value, form)
+    return "none" if value is None else str(value).lower()
+
+
 def leaf_names(cls: Any, prefix: str = "") -> list[str]:
     """The dotted names of all plain values of a dataclass and those it holds."""
     names = []

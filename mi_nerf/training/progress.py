@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import sys
 import time
 from typing import Any
 
 import numpy as np
-from tqdm.auto import tqdm
 
+from ..bars import bars_are_seen, progress_bar
 from .config import TrainConfig
 from .trainer import StepResult
 
@@ -29,6 +28,10 @@ class Meter:
         self._rays += int(result.rays[0])
         self._queries += result.queries
 
+    def pause(self, seconds: float) -> None:
+        """Leaves out time that has passed without training."""
+        self._start += seconds
+
     def summary(self) -> dict[str, Any]:
         elapsed = max(time.monotonic() - self._start, 1e-9)
         mse = float(np.mean(self._errors)) if self._errors else math.nan
@@ -47,16 +50,15 @@ class ProgressBar:
     def __init__(self, config: TrainConfig, initial: float, show: bool) -> None:
         by_time = config.max_seconds is not None
         self._scale = float(config.max_seconds or config.steps or 1)
-        terminal = show and sys.stderr.isatty()
-        self._bar = tqdm(
-            total=round(self._scale, 1),
+        self._bar = progress_bar(
+            "train",
+            "s" if by_time else "step",
+            round(self._scale, 1),
+            show=show,
             initial=round(initial * self._scale, 1),
-            unit="s" if by_time else "step",
-            desc="train",
-            disable=not terminal,
             bar_format="{desc} {percentage:3.0f}%|{bar}| {n:.0f}/{total:.0f} {unit}{postfix}",
         )
-        self._lines = show and not terminal
+        self._lines = show and not bars_are_seen()
         self._last_line = -math.inf
 
     def __enter__(self) -> ProgressBar:

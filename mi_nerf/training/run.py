@@ -6,21 +6,25 @@ import json
 import platform
 import time
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .. import __version__
 from ..backend import array_module
+from ..cameras import Intrinsics
 from ..data import Dataset, load_dataset
 from ..errors import InputError
 from ..field_file import FieldFile, save_field
 from ..files import check_folder, make_folder, read_json, write_json
 from ..interrupts import interruptible
+from ..views import Image, View, display_image, render_view
 from ..volume import MarchSettings
 from .auto import Choice, Decision, choose
 from .checkpoint import load_checkpoint, save_checkpoint
@@ -56,15 +60,18 @@ class Run:
     ) -> None:
         """
         Args:
-            started: the value of ``time.monotonic()`` from which seconds count.
+            started: the value of ``time.monotonic()`` from which seconds count; none: they
+                count while :meth:`reports` is at work.
             trainer: of this configuration and dataset, to go on with if it has begun.
         """
         self.folder, self.config, self.variant = folder, config, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
-        self._started = time.monotonic() if started is None else started
+        self.interrupted = False  # by Ctrl-C, when last trained
+        self._started = started  # None: the clock stands still,
+        self._paused = time.monotonic()  # since then
         self.trainer = trainer or Trainer(config, dataset, array_module(variant))
         self._blank = self.trainer.blank_loss
-        self._before = 0.0  # seconds of training before this process
+        self._before = 0.0  # seconds of training before the clock was last started
         self._skipped = 0
         self._skipped_in_row = 0
         self._attempt_start = 0
@@ -77,7 +84,8 @@ class Run:
     @property
     def seconds(self) -> float:
         """Wall-clock seconds of training so far, earlier processes included."""
-        return self._before + time.monotonic() - self._started
+        now = time.monotonic()
+        return self._before + now - (now if self._started is None else self._started)
 
     @property
     def progress(self) -> float:
@@ -103,32 +111,90 @@ class Run:
             ) from error
         _cut_log(self.folder / LOG, self.trainer.step_count)
 
-    def train(self, show_bar: bool = True) -> None:
+    def train(
+        self, show_bar: bool = True, after_step: Callable[[Run], object] | None = None
+    ) -> None:
         """Trains until the budget is spent or the user interrupts; always saves.
+
+        Args:
+            after_step: called after every step; :meth:`clock_stopped` is for it.
 
         Raises:
             TrainingError: after too many non-finite steps in a row, or collapses.
         """
-        bar = ProgressBar(self.config, self.progress, show_bar)
+        with ProgressBar(self.config, self.progress, show_bar) as bar:
+            for line in self.reports(after_step):
+                bar.update(self.progress, line, self.interrupted)
+
+    def reports(
+        self, after_step: Callable[[Run], object] | None = None
+    ) -> Iterator[dict[str, Any]]:
+        """Trains as :meth:`train` does, and hands over every report on the way.
+
+        A report is a line of the log: ``step``, ``seconds`` (of training), ``loss``, ``psnr``
+        (dB, of the training rays), ``samples_per_ray``, ``samples_per_second``,
+        ``learning_rate``, ``occupied`` (share of the box), ``skipped`` steps: means since the
+        last one, ``report_every`` seconds ago. What the caller does between two reports takes
+        no training time. Ctrl-C, or *interrupt* in a notebook, ends training after the present
+        step; leaving the loop ends it, too. Either way the run is saved, and a further call
+        goes on.
+
+        Raises:
+            TrainingError: after too many non-finite steps in a row, or collapses.
+        """
+        self._start_clock()
         last_report = last_save = self.seconds
-        with (self.folder / LOG).open("a") as log, interruptible() as stop, bar:
-            self._log = log
+        with (self.folder / LOG).open("a") as log, interruptible() as stop:
+            self._log, self.interrupted = log, False
             # At least one step, so that there is always a field to look at.
             while (self.progress < 1 or self.trainer.step_count == 0) and not stop:
                 self._advance()
                 if self._collapsed():
                     self._restart()
                 now = self.seconds
-                finished = self.progress >= 1 or bool(stop)
+                self.interrupted = bool(stop)
+                finished = self.progress >= 1 or self.interrupted
                 if now - last_report >= self.config.report_every or finished:
                     self._settle()
-                    bar.update(self.progress, self._report(), bool(stop))
-                    last_report = now
+                    line, last_report = self._report(), now
+                    try:
+                        with self.clock_stopped():
+                            yield line
+                    except GeneratorExit:  # the caller left the loop
+                        break
                 if now - last_save >= self.config.checkpoint_every:
                     self.save()
                     last_save = self.seconds
+                if after_step is not None:
+                    after_step(self)
+            self.interrupted = bool(stop)
             self._settle()
             self.save()
+        self.pause()
+
+    def view(self, intrinsics: Intrinsics, cam_to_world: ArrayLike, spp: int = 1) -> View:
+        """What a camera sees of the field as it is now; see :func:`mi_nerf.views.render_view`.
+
+        Args:
+            cam_to_world: (4, 4), OpenGL axes.
+            spp: rays a pixel, rounded down to a square number.
+        """
+        trainer = self.trainer
+        with dr.suspend_grad():
+            return render_view(
+                trainer.field,
+                intrinsics,
+                cam_to_world,
+                self._render_settings(),
+                array_module(self.variant),
+                occupancy=trainer.occupancy,
+                spp=spp,
+            )
+
+    def picture(self, dataset: Dataset, index: int) -> Image:
+        """(H, W, 3) sRGB: the field as it is now, on white, from a view of a dataset."""
+        view = self.view(dataset.intrinsics, dataset.cam_to_world[index])
+        return display_image(view, self.trainer.field.color_space)
 
     def save(self) -> None:
         """Writes the checkpoint and the field file."""
@@ -143,22 +209,49 @@ class Run:
 
     def field_file(self) -> FieldFile:
         """The field as it is now, as XML scenes will load it."""
-        trainer, sampling = self.trainer, self.config.sampling
+        trainer = self.trainer
         return FieldFile(
             trainer.field_config,
             trainer.field.weights(),
             trainer.occupancy.mask() if trainer.occupancy is not None else None,
-            MarchSettings(
-                samples=sampling.render_samples,
-                fine=sampling.fine if sampling.render_fine is None else sampling.render_fine,
-                near=sampling.near,
-                far=sampling.far,
-                rule=sampling.rule,
-                stop=sampling.render_stop,
-            ),
+            self._render_settings(),
             {"mi_nerf": __version__, "preset": self.config.preset, "steps": trainer.step_count},
             None if trainer.field.coarse is None else trainer.field.coarse.weights(),
         )
+
+    def _render_settings(self) -> MarchSettings:
+        """How rays are sampled when nothing is trained."""
+        sampling = self.config.sampling
+        return MarchSettings(
+            samples=sampling.render_samples,
+            fine=sampling.fine if sampling.render_fine is None else sampling.render_fine,
+            near=sampling.near,
+            far=sampling.far,
+            rule=sampling.rule,
+            stop=sampling.render_stop,
+        )
+
+    # ---------------------------------- The clock ----------------------------------
+
+    @contextmanager
+    def clock_stopped(self) -> Iterator[None]:
+        """What happens inside is not training time; steps under way are waited for before."""
+        dr.sync_thread()
+        self.pause()
+        try:
+            yield
+        finally:
+            self._start_clock()
+
+    def pause(self) -> None:
+        """Stops the clock until training goes on."""
+        if self._started is not None:
+            self._before, self._started, self._paused = self.seconds, None, time.monotonic()
+
+    def _start_clock(self) -> None:
+        if self._started is None:
+            self._started = time.monotonic()
+            self._since.pause(self._started - self._paused)
 
     # ---------------------------------- One step ----------------------------------
 
@@ -252,7 +345,8 @@ def start(
     """Opens a run: a new one in an empty folder, or the one that is there with ``resume``.
 
     With ``resume`` the folder's own configuration holds; only ``steps`` and
-    ``max_seconds`` of ``config`` take its place, where given. A new run with preset
+    ``max_seconds`` of ``config`` take its place, where given. Seconds count from ``started``,
+    or else while this function and :meth:`Run.reports` are at work. A new run with preset
     ``auto`` first chooses its model, within its time but besides its steps; settings
     named in ``given`` or unlike the preset's are kept.
 
@@ -260,6 +354,7 @@ def start(
         InputError: if the folder already holds a run, or the data cannot be read.
     """
     folder = Path(out)
+    clock = time.monotonic() if started is None else started
     recorded = resume and (folder / CONFIG).exists()
     if recorded:
         config = _resumed_config(folder, config, data)
@@ -271,9 +366,8 @@ def start(
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
     choice = Choice(config, [])
     if config.preset == "auto" and not recorded:
-        started = time.monotonic() if started is None else started
         choice = choose(config, dataset, array_module(variant), given=given)
-    run = Run(folder, choice.config, dataset, variant, started=started, trainer=choice.trainer)
+    run = Run(folder, choice.config, dataset, variant, started=clock, trainer=choice.trainer)
     run.decisions = choice.decisions
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
@@ -281,6 +375,8 @@ def start(
     else:
         (folder / LOG).unlink(missing_ok=True)
         write_json(folder / CONFIG, _record(run, dataset))
+    if started is None:
+        run.pause()
     return run
 
 

@@ -1,0 +1,224 @@
+"""PSNR against seconds of training, for several models and seeds."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..data import held_out_split, load_dataset
+from ..errors import InputError
+from ..evaluation import evaluate
+from ..files import make_folder, read_json, replacing, write_json
+from ..machine import machine
+from ..target import Target
+from ..training.config import TrainConfig, setting_names, to_json, with_settings
+from ..training.presets import preset
+from ..training.run import CONFIG, Run
+from ..trainings import check_same, mean, trained
+
+Record = dict[str, Any]
+
+RECORD = "report.json"
+CURVE = "curve.jsonl"  # in the folder of a run: a line for each look at its field
+_FIRST = 1 / 16  # of the budget, after which a field is first looked at
+
+
+def rows_of(
+    presets: Sequence[str], vary: Mapping[str, Sequence[str]], settings: Sequence[str] = ()
+) -> dict[str, TrainConfig]:
+    """A configuration for each preset and each combination of varied settings, by its name.
+
+    Args:
+        vary: values of settings, as ``{"network.width": ["32", "64"]}``.
+        settings: ``key=value`` for all of them.
+
+    Raises:
+        InputError: for unknown presets, settings or values, or none of them.
+    """
+    for key, values in vary.items():
+        if not values:
+            raise InputError(f"--vary {key}: expected key=value,value,...")
+        if key not in setting_names():
+            with_settings(preset("nerf"), [f"{key}={values[0]}"])  # says what may be meant
+    if not presets:
+        raise InputError("--presets: nothing to train, expected at least one")
+    rows = {}
+    for name in presets:
+        base = with_settings(preset(name), list(settings))
+        for values in itertools.product(*vary.values()):
+            changes = [f"{key}={value}" for key, value in zip(vary, values, strict=True)]
+            rows[", ".join([name, *changes])] = with_settings(base, changes)
+    return rows
+
+
+def training_curves(
+    data: str | Path,
+    out: str | Path,
+    rows: Mapping[str, TrainConfig],
+    variant: str,
+    *,
+    seeds: int = 3,
+    split: str | None = None,
+    views: int = 10,
+    looks: int = 8,
+    given: Sequence[str] = (),
+    on_run: Callable[[str, int], object] | None = None,
+) -> Record:
+    """Trains every row with every seed, and measures held-out views from time to time.
+
+    The clock of training stands still meanwhile; what it shows includes reading the images
+    and compiling. Called again, it goes on where it was interrupted.
+
+    Args:
+        rows: by name; each with its budget, ``steps`` or ``max_seconds`` (:func:`rows_of`).
+        seeds: runs of each row, with seeds from its own on.
+        split: views to measure; default: test, or what there is beside train.
+        views: so many of them, evenly spread.
+        looks: how often in each training, at shares of its budget from 1/16 to 1 that grow
+            by a constant factor.
+        given: names of settings that preset ``auto`` must not choose.
+        on_run: called with the name and the seed before each training.
+
+    Returns:
+        What ``out/report.json`` holds: ``rows``, each with ``name``, ``curve`` (means of the
+        seeds that did not fail, a point a look: ``seconds``, ``psnr``, ``least``,
+        ``greatest``), ``psnr`` at the end, ``seeds``, ``failures`` and ``runs``. ``complete`` is
+        false after Ctrl-C.
+
+    Raises:
+        InputError: if the data cannot be read, or the folder holds something else.
+    """
+    for name, value in (("seeds", seeds), ("views", views), ("looks", looks)):
+        if value < 1:
+            raise InputError(f"--{name} {value}: expected at least 1")
+    split = split or held_out_split(data)
+    if split is None:
+        raise InputError(f"{data}: has training views alone, expected --split train")
+    load_dataset(data, split, limit=1)  # before hours of work
+    folder = Path(out)
+    settings = {
+        "data": str(Path(data).resolve()),
+        "split": split,
+        "views": views,
+        "looks": looks,
+        "rows": {name: to_json(config) for name, config in rows.items()},
+    }
+    check_same(folder, RECORD, settings, "a report on trainings")
+    record = {"settings": settings, "machine": machine(variant), "complete": False, "rows": []}
+    make_folder(folder)
+    write_json(folder / RECORD, record)
+    results: dict[str, list[Record]] = {name: [] for name in rows}
+    for seed in range(seeds):  # whole sets first: an early end leaves something to compare
+        for name, config in rows.items():
+            wanted = replace(config, seed=config.seed + seed)
+            if on_run is not None:
+                on_run(name, wanted.seed)
+            place = folder / "runs" / _slug(name) / f"seed_{wanted.seed}"
+            watch = Watch(place, looks, lambda run: _look(run, split, views))
+            result = trained(data, place, wanted, variant, _ending, given=given, after_step=watch)
+            if result is None:
+                return _finish(folder, record, results)
+            results[name].append({**result, "seed": wanted.seed, "curve": read_curve(place)})
+    record["complete"] = True
+    return _finish(folder, record, results)
+
+
+class Watch:
+    """Looks at a run now and then, and keeps what it sees in the run's folder."""
+
+    def __init__(self, folder: Path, looks: int, look: Callable[[Run], Record]) -> None:
+        self._file, self._look = folder / CURVE, look
+        self._shares = np.geomspace(_FIRST, 1, looks) if looks > 1 else np.ones(1)
+        self._lines: list[Record] | None = None
+
+    def __call__(self, run: Run) -> None:
+        """To be called after every step."""
+        if self._lines is None:
+            # A run that was killed goes on from a checkpoint: looks after that are repeated.
+            before = read_curve(self._file.parent)
+            self._lines = [line for line in before if line["step"] < run.trainer.step_count]
+        due = int(np.sum(self._shares <= run.progress))
+        if due <= max((line["look"] for line in self._lines), default=0):
+            return
+        with run.clock_stopped():
+            seen = {"look": due, "step": run.trainer.step_count, "seconds": run.seconds}
+            self._lines.append({**seen, **self._look(run)})
+            with replacing(self._file) as temporary:
+                temporary.write_text("".join(json.dumps(line) + "\n" for line in self._lines))
+
+
+def read_curve(folder: Path) -> list[Record]:
+    """What a :class:`Watch` has written: ``look`` (from 1), ``step``, ``seconds``, ``psnr``, ...
+
+    Raises:
+        InputError: if the file is damaged.
+    """
+    path = folder / CURVE
+    if not path.exists():
+        return []
+    try:
+        return [json.loads(line) for line in path.read_text().splitlines()]
+    except ValueError as error:
+        raise InputError(f"{path}: cannot be read as a curve of training: {error}") from error
+
+
+def _look(run: Run, split: str, views: int) -> Record:
+    """The quality of a field in training."""
+    config = read_json(run.folder / CONFIG, "the config.json of a run")
+    target = Target(run.folder, run.field_file(), config, run.config.downscale)
+    found = evaluate(target, run.variant, split=split, views=views)
+    return {**found["mean"], "queries_per_ray": found["queries_per_ray"]}
+
+
+def _ending(run: Run) -> Record:
+    parameters = run.field_file().parameter_count()
+    return {"seconds": run.seconds, "steps": run.trainer.step_count, "parameters": parameters}
+
+
+def _slug(name: str) -> str:
+    """A name as that of a folder."""
+    return "".join(c if c.isalnum() or c in "._-=" else "_" for c in name.replace(", ", "__"))
+
+
+def _finish(folder: Path, record: Record, results: Mapping[str, list[Record]]) -> Record:
+    record["rows"] = [summary(name, runs) for name, runs in results.items() if runs]
+    write_json(folder / RECORD, record)
+    return record
+
+
+def summary(name: str, runs: list[Record]) -> Record:
+    """A row of the record: means of the seeds that did not fail."""
+    good = [run for run in runs if run["failed"] is None and run["curve"]]
+    curve = []
+    for look in sorted({line["look"] for run in good for line in run["curve"]}):
+        lines = [line for run in good for line in run["curve"] if line["look"] == look]
+        values = [line["psnr"] for line in lines if line["psnr"] is not None]
+        if values:
+            curve.append(
+                {
+                    "seconds": mean(line["seconds"] for line in lines),
+                    "psnr": mean(values),
+                    "least": min(values),
+                    "greatest": max(values),
+                    "seeds": len(values),
+                }
+            )
+    last = [run["curve"][-1] for run in good]
+    return {
+        "name": name,
+        "psnr": mean(line["psnr"] for line in last),
+        "ssim": mean(line["ssim"] for line in last),
+        "queries_per_ray": mean(line["queries_per_ray"] for line in last),
+        "seconds": mean(line["seconds"] for line in last),
+        "parameters": mean(run["parameters"] for run in good),
+        "seeds": len(runs),
+        "failures": len(runs) - sum(run["failed"] is None for run in runs),
+        "curve": curve,
+        "runs": runs,
+    }

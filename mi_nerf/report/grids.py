@@ -1,0 +1,69 @@
+"""Occupancy grids of any resolution and threshold for a field that is already trained."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import NDArray
+
+from ..field import Field
+from ..occupancy import OccupancyGrid, grid_shape
+
+Cells = NDArray[np.bool_]
+
+_LOOKS, _MOST_LOOKS = 32, 1 << 21  # at random points of each cell, unless there are too many
+_BLOCK = 16384  # points at a time
+
+
+def own_resolution(grid: OccupancyGrid | None) -> int | None:
+    """Cells along the longest side, of a grid that there is."""
+    return None if grid is None else max(grid.shape)
+
+
+class Grids:
+    """Looks at a field once for each resolution, and draws the line at any threshold."""
+
+    def __init__(self, field: Field, own: OccupancyGrid | None, float_type: Any) -> None:
+        """With a grid of its ``own``, nothing is looked for outside of that."""
+        self._field, self._own, self._float = field, own, float_type
+        self._seen: dict[int, OccupancyGrid] = {}
+
+    def at(self, resolution: int, threshold: float) -> OccupancyGrid:
+        """The grid whose cells were seen to be thicker than ``threshold``, optically.
+
+        Args:
+            resolution: cells along the longest side of the box.
+        """
+        if resolution not in self._seen:
+            self._seen[resolution] = self._look(resolution)
+        grid = self._seen[resolution]
+        # One look more, in which nothing decays, sets the mask.
+        rng = dr.rng(1)
+        grid.refresh(self._field, rng, 0, queries=2, threshold=threshold, decay=1.0)
+        return OccupancyGrid(grid.lower, grid.upper, grid.mask(), self._float)
+
+    def _look(self, resolution: int) -> OccupancyGrid:
+        field = self._field
+        shape = grid_shape(field.lower, field.upper, resolution)
+        cells = np.ones(shape, bool) if self._own is None else resampled(self._own.mask(), shape)
+        grid = OccupancyGrid(field.lower, field.upper, cells, self._float)
+        rng = dr.rng(0)
+        count = int(cells.sum())
+        pairs = int(np.clip(_MOST_LOOKS // max(2 * count, 1), 1, _LOOKS // 2))
+        for turn in range(-(-count // _BLOCK) * pairs):  # each looks at cells of two sets
+            grid.refresh(field, rng, turn, queries=2 * _BLOCK, threshold=0, decay=1.0)
+        return grid
+
+
+def resampled(cells: Cells, shape: tuple[int, int, int]) -> Cells:
+    """Cells of another size over the same box: those that overlap any of ``cells``."""
+    for axis, new in enumerate(shape):
+        old = cells.shape[axis]
+        parts = [
+            cells.take(range(i * old // new, -(-(i + 1) * old // new)), axis).any(axis)
+            for i in range(new)
+        ]
+        cells = np.stack(parts, axis)
+    return cells
