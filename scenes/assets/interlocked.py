@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from geometry import Array, grid_faces, output_folder, write_ply
 
-AROUND, ACROSS = 96, 16
+AROUND, ACROSS = 64, 12
 
 
 def ring(radius: float, thickness: float) -> tuple[Array, Array, Array]:
