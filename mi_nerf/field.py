@@ -206,10 +206,10 @@ class NeuralField:
         raw = network.color_head(config.network, self._weights, h, direction)
         return self._density(network.density_head(self._weights, h), p), self._color(raw)
 
-    def fused(self) -> Callable[[Any, Any], tuple[Any, list[Any]]] | None:
+    def fused(self, emission: bool = True) -> Callable[..., Any] | None:
         """:meth:`density_emission` of the weights as they are, as one kernel without gradients.
 
-        ``None`` where that would be slower.
+        Without ``emission``, :meth:`density`. ``None`` where that would be slower.
         """
         config = self.config
         if not worth_fusing(config.network, type(next(iter(self._weights.values())).array)):
@@ -221,7 +221,10 @@ class NeuralField:
             density, color = fused(self._features(p), direction)
             return self._density(density, p), self._color(color)
 
-        return density_emission
+        def density(p: Any) -> Any:
+            return self._density(fused.density(self._features(p)), p)
+
+        return density_emission if emission else density
 
     def _trunk(self, p: Any) -> Any:
         with stage("encoding"):

@@ -41,11 +41,8 @@ class FusedNetwork:
         Args:
             position, direction: features, one array of N values each.
         """
-        config, h = self._config, nn.CoopVec(*position)
-        x, v = h, None if direction is None else nn.CoopVec(*direction)
-        for i in range(config.depth):
-            extra = {"position_weight": x} if i == config.skip else {}
-            h = self._layer(f"trunk_{i}", h, extra, rectify=True)
+        config, h = self._config, self._trunk(position)
+        v = None if direction is None else nn.CoopVec(*direction)
         density = self._layer("density", h, {})
         if config.feature_layer:
             h = self._layer("feature", h, {}, rectify=config.feature_relu)
@@ -54,6 +51,17 @@ class FusedNetwork:
             h = self._layer(f"view_{i}", h, seen if i == 0 else {}, rectify=True)
         color = self._layer("color", h, seen if config.view_depth == 0 else {})
         return next(iter(density)), list(color)
+
+    def density(self, position: list[Any]) -> Any:
+        """Raw density of N queries alone."""
+        return next(iter(self._layer("density", self._trunk(position), {})))
+
+    def _trunk(self, position: list[Any]) -> Any:
+        x = h = nn.CoopVec(*position)
+        for i in range(self._config.depth):
+            extra = {"position_weight": x} if i == self._config.skip else {}
+            h = self._layer(f"trunk_{i}", h, extra, rectify=True)
+        return h
 
     def _layer(self, name: str, x: Any, extra: dict[str, Any], *, rectify: bool = False) -> Any:
         views = self._views

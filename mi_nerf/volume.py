@@ -271,11 +271,13 @@ class Evaluation:
         keep: bool = False,
         stop: float = 0.0,
         tail: int | None = None,
+        emission: bool = True,
     ) -> None:
         """Evaluates the field; with ``keep``, activations stay for :meth:`backward`.
 
         Args:
             block: queries the network evaluates at a time.
+            emission: whether it is wanted; a network is asked for its density alone else.
             tail: of the last blocks, to waste less on filling them up. Default: a quarter
                 of large blocks in rounds, else the same.
         """
@@ -283,9 +285,10 @@ class Evaluation:
         self._graph: list[tuple[Any, Any, list[Any]]] = []
         self._tail = tail or (block // 4 if stop > 0 and block >= 4096 else block)
         fused = getattr(field, "fused", None)
-        self._fused = fused() if fused is not None and not keep else None
+        self._fused = fused(emission) if fused is not None and not keep else None
+        self._emits = emission
         float_type = type(samples.t)
-        self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4)]
+        self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4 if emission else 1)]
         dr.make_opaque(self._channels)  # without queries they would stay constants
         if stop <= 0:
             self.asked = samples.index
@@ -343,7 +346,7 @@ class Evaluation:
 
     @property
     def emission(self) -> list[Any]:
-        """Three arrays of R·S colours."""
+        """Three arrays of R·S colours, or none if not wanted."""
         return self._channels[1:]
 
     def enable_grad(self) -> None:
@@ -417,6 +420,8 @@ class Evaluation:
         ray = where // samples.count
         t = dr.gather(type(samples.t), samples.t, where)
         p = points_along(samples.o, samples.d, t, ray)
+        if not self._emits:
+            return [(fused or self._field.density)(p)]
         ask = fused or self._field.density_emission
         density, emission = ask(p, gather_vector3(samples.view, ray))
         return [density, *emission]

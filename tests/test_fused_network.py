@@ -50,6 +50,9 @@ def test_both_ways_agree(config: NeuralFieldConfig) -> None:
     assert fused is not None
     (density, color), (one_density, one_color) = field.density_emission(p, d), fused(p, d)
     assert np.std(np.array(density)) > 0
+    alone = field.fused(emission=False)
+    assert alone is not None
+    np.testing.assert_allclose(np.array(alone(p)), np.array(one_density), rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(np.array(one_density), np.array(density), rtol=2e-5, atol=2e-5)
     for expected, found in zip(color, one_color, strict=True):
         np.testing.assert_allclose(np.array(found), np.array(expected), rtol=2e-5, atol=2e-5)

@@ -13,15 +13,18 @@ import OpenEXR
 import pytest
 
 from mi_nerf.backend import choose_variant
+from mi_nerf.cli import main
 from mi_nerf.data import load_dataset
 from mi_nerf.generation import PROTOCOLS, Options, generate
+from mi_nerf.plugins.placement import find_fields
 from mi_nerf.scene_file import SceneFile, visible_bounds
 from mi_nerf.scene_library import find_scene, scene_folder, scenes
 
 VARIANT = choose_variant()
 FOLDER = scene_folder()
 ASSETS = FOLDER / "assets"
-NAMES = sorted(scenes())
+COMPOSED = sorted(path.stem for path in (FOLDER / "composed").glob("*.xml"))
+NAMES = sorted(set(scenes()) - set(COMPOSED))
 GROUPS = {"realistic": 8, "diffuse": 4, "forward": 2, "hard": 4}
 PLUGINS = {"integrator", "sensor", "film", "sampler", "emitter", "shape", "bsdf", "medium"}
 
@@ -60,7 +63,31 @@ def test_every_scene(name: str) -> None:
     assert image[..., :3].max() > 0.1
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", COMPOSED)
+def test_scenes_of_fields(name: str, tmp_path: Path) -> None:
+    """Found and rendered by name; in some pixels there is a field, in some there is none."""
+    picture = tmp_path / "picture.exr"
+    size = ["--size", "40", "20", "--spp", "2"]
+    assert main(["render", name, "-o", str(picture), "--variant", VARIANT, *size]) == 0
+    image = OpenEXR.File(str(picture)).channels()["RGBA"].pixels
+    assert image.shape == (20, 40, 4) and np.isfinite(image).all() and (image[..., 3] > 0.999).all()
+    mi.set_variant(VARIANT)
+    file = SceneFile(find_scene(name), {"width": "40", "height": "20", "spp": "1", "depth": "1"})
+    scene = file.load()
+    assert len(find_fields(scene)) == (2 if name == "interlocked" else 1)
+    opaque = mi.load_dict({"type": "nerf", "aovs": "opacity"})
+    opacity = np.array(mi.render(scene, integrator=opaque))[..., 4]
+    assert 0.05 < (opacity > 0.9).mean() < 0.6 and (opacity == 0).mean() > 0.2
+
+
+def test_fields_are_small() -> None:
+    files = list((FOLDER / "fields").iterdir())
+    assert all(path.stat().st_size < 600e3 for path in files)
+    text = "".join(path.read_text() for path in (FOLDER / "composed").glob("*.xml"))
+    assert all(path.name in text for path in files)
+
+
+@pytest.mark.parametrize("name", NAMES + COMPOSED)
 def test_everything_has_an_id(name: str) -> None:
     """Otherwise Mitsuba names parameters after addresses in memory."""
     root = ElementTree.parse(find_scene(name)).getroot()

@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from ..backend import choose_variant
 from ..errors import InputError
 from ..rendering import check_output, frames_of, output_kind, write_frames
+from ..scene_library import scenes
 from .shared import Variant, positive, progress_bar
 
 
@@ -25,10 +26,12 @@ class Render:
     mi-nerf render runs/lego -o test_views/ --path test
 
     mi-nerf render scene.xml -o scene.exr --spp 64
+
+    mi-nerf render table -o table.png
     """
 
     target: Positional[Annotated[Path, arg(metavar="TARGET")]]
-    """A run folder or a Mitsuba XML scene."""
+    """A run folder, a Mitsuba XML scene, or the name of a scene that comes with mi_nerf."""
     out: Annotated[Path, arg(aliases=["-o"])]
     """An .exr, .png or .mp4 file, or a folder of pictures."""
     path: Literal["orbit", "spiral", "test"] | None = None
@@ -53,7 +56,7 @@ class Render:
             )
         check_output(self.out, self.frames or 1)
         count, images = frames_of(
-            self.target,
+            self._target(),
             choose_variant(self.variant),
             path=self.path,
             frames=self.frames,
@@ -64,3 +67,7 @@ class Render:
         with progress_bar("render", "frame", count) as bar:
             write_frames(self.out, count, images, on_frame=bar.update)
         print(f"{self.out}: {count} frame{'s' if count != 1 else ''}")
+
+    def _target(self) -> Path:
+        """What lies at the path, or else the scene of that name."""
+        return self.target if self.target.exists() else scenes().get(str(self.target), self.target)

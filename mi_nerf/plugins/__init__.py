@@ -1,4 +1,6 @@
-"""The Mitsuba plugins ``nerf`` and ``nerf_tracking`` (integrators) and ``nerfmedium`` (medium).
+"""The Mitsuba plugins of radiance fields.
+
+Integrators ``nerf``, ``nerf_path`` and ``nerf_tracking``, and the medium ``nerfmedium``.
 
 Plugin classes inherit from classes of the active Mitsuba variant, so the modules
 that define them are imported again whenever the variant changes.
@@ -12,7 +14,16 @@ import sys
 import mitsuba as mi
 
 # Each before those that import it.
-_MODULES = ("medium", "backdrop", "camera", "integrator", "tracking")
+_MODULES = (
+    "medium",
+    "backdrop",
+    "paths",
+    "camera",
+    "marching",
+    "integrator",
+    "path_integrator",
+    "tracking",
+)
 _loaded_for: str | None = None
 _follows_variant = False
 

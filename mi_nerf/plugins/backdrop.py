@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,14 +22,40 @@ from .placement import is_field
 class Behind:
     """What camera rays meet where fields do not stop them."""
 
-    radiance: list[Any]  # R, G, B
-    valid: Any  # 1 where there is something opaque, to the film's alpha channel
     distance: Any = None  # to the first surface, infinite where there is none; None: nowhere
     normal: Any = None  # of that surface, in world coordinates; 0 where there is none
+    radiance: list[Any] = dataclasses.field(default_factory=list)  # R, G, B
+    valid: Any = None  # 1 where there is something opaque, to the film's alpha channel
     states: Any = None  # of the nested integrator, which some need for derivatives
 
 
-class Environment:
+class Backdrop(ABC):
+    """All that is no field: says first how far fields can be seen, then what is behind them."""
+
+    @abstractmethod
+    def meet(self, ray: Any) -> Behind:
+        """Distance and normal of what the rays meet first."""
+
+    @abstractmethod
+    def look(self, behind: Behind, ray: Any, sampler: Any, opacity: Any) -> None:
+        """Fills in the radiance from there, and ``valid``.
+
+        Args:
+            behind: what :meth:`meet` returned.
+            opacity: of the fields before it, which says how much the radiance matters. The
+                radiance is what arrives without them.
+        """
+
+    @abstractmethod
+    def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
+        """Carries gradients of the radiance to the parameters of surfaces and lights."""
+
+    @abstractmethod
+    def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
+        """The derivative of the radiance along the gradients of surfaces and lights."""
+
+
+class Environment(Backdrop):
     """The environment emitter, infinitely far away, or black."""
 
     def __init__(self, scene: mi.Scene, visible: bool, encoded: bool) -> None:
@@ -35,9 +63,13 @@ class Environment:
         self._emitter = scene.environment() if visible else None
         self._encoded = encoded
 
-    def look(self, ray: Any, sampler: Any) -> Behind:
+    def meet(self, ray: Any) -> Behind:
+        """Nothing, at any distance."""
+        return Behind()
+
+    def look(self, behind: Behind, ray: Any, sampler: Any, opacity: Any) -> None:
         """Radiance from along the rays."""
-        return Behind(self._radiance(ray), mi.Float(0))
+        behind.radiance, behind.valid = self._radiance(ray), mi.Float(0)
 
     def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
         """Carries gradients of the radiance to the emitter."""
@@ -58,7 +90,7 @@ class Environment:
         return [linear_to_srgb(c) for c in radiance] if self._encoded else radiance
 
 
-class Surfaces:
+class Surfaces(Backdrop):
     """All shapes but the cubes of fields, as a nested integrator shows them."""
 
     def __init__(
@@ -73,9 +105,19 @@ class Surfaces:
         self._scene, self._integrator = scene, integrator
         self._paths, self._normals = paths, normals
 
-    def look(self, ray: Any, sampler: Any) -> Behind:
+    def meet(self, ray: Any) -> Behind:
+        """The first surface along the rays."""
+        if not self._normals:
+            pi = self._scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
+            behind = Behind(pi.t, mi.Normal3f(0))
+        else:
+            si = self._scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=True)
+            behind = Behind(si.t, dr.select(si.is_valid(), si.sh_frame.n, 0))
+        dr.eval(behind.distance, behind.normal)
+        return behind
+
+    def look(self, behind: Behind, ray: Any, sampler: Any, opacity: Any) -> None:
         """What the nested integrator returns for the rays, on average."""
-        distance, normal = self._first(ray)
         total, states, valid = mi.Color3f(0), [], mi.Bool(False)
         sampler = sampler.clone()
         for _ in range(self._paths):
@@ -84,10 +126,9 @@ class Surfaces:
             states.append(state)
             sampler.schedule_state()
             dr.eval(total, valid, state)
-        radiance = list(total * (1 / self._paths))
-        seen = Behind(radiance, dr.select(valid, mi.Float(1), 0), distance, normal, states)
-        dr.eval(seen.radiance, seen.valid, seen.distance, seen.normal)
-        return seen
+        behind.radiance = list(total * (1 / self._paths))
+        behind.valid, behind.states = dr.select(valid, mi.Float(1), 0), states
+        dr.eval(behind.radiance, behind.valid)
 
     def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
         """Carries gradients of the radiance to the parameters of surfaces and lights."""
@@ -121,14 +162,6 @@ class Surfaces:
             sampler.schedule_state()
             dr.eval(total)
         return list(total * (1 / self._paths))
-
-    def _first(self, ray: Any) -> tuple[Any, Any]:
-        """Distance to the first surface, infinite without one, and its normal."""
-        if not self._normals:
-            pi = self._scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
-            return pi.t, mi.Normal3f(0)
-        si = self._scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=True)
-        return si.t, dr.select(si.is_valid(), si.sh_frame.n, 0)
 
     def _differentiable(self) -> bool:
         """Whether any parameter has a gradient: some integrators refuse to work without."""
@@ -207,6 +240,19 @@ def check_nested(integrator: Any) -> None:
 def has_surfaces(scene: mi.Scene) -> bool:
     """Whether a scene holds any shape but cubes of fields."""
     return not all(_holds_field(shape) for shape in scene.shapes())
+
+
+def check_no_loose_field(scene: mi.Scene) -> None:
+    """Refuses a field that is part of the scene, but not of any of its shapes.
+
+    Raises:
+        InputError: naming it.
+    """
+    for part in _parts(scene):
+        if isinstance(part, mi.Medium) and is_field(part):
+            raise InputError(
+                f"nerfmedium: '{part.id()}' is in no shape, expected the interior of a 'cube'"
+            )
 
 
 def _holds_field(part: Any) -> bool:

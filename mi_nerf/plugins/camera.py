@@ -13,8 +13,6 @@ from mitsuba.ad.integrators.common import ADIntegrator
 
 from ..errors import InputError
 
-# Camera rays traced at a time; more samples per pixel take several passes.
-_RAYS_PER_PASS = 1 << 22
 _AXES = (".X", ".Y", ".Z")
 
 
@@ -39,6 +37,7 @@ class FieldIntegrator(ADIntegrator):
     plugin: str  # its name
     known: tuple[str, ...]  # extra channels that it offers
     wave: type[Wave]
+    rays_per_pass = 1 << 22  # traced at a time; more samples per pixel take several passes
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -50,7 +49,6 @@ class FieldIntegrator(ADIntegrator):
         self.near, self.far = props.get("near", None), props.get("far", None)
         # Read by the base class in C++; kept here for the background.
         self.show_background = not bool(props.get("hide_emitters", False))
-        self.encoded = bool(props.get("encoded", False))
         self.aovs = self._parse_aovs(str(props.get("aovs", "")))
 
     def aov_names(self) -> list[str]:
@@ -120,7 +118,7 @@ class FieldIntegrator(ADIntegrator):
         film = sensor.film()
         spp = spp or sensor.sampler().sample_count()
         pixels = int(dr.prod(film.crop_size()))
-        per_pass = max(1, min(spp, _RAYS_PER_PASS // max(pixels, 1)))
+        per_pass = max(1, min(spp, self.rays_per_pass // max(pixels, 1)))
         passes = -(-spp // per_pass)
         for i in range(passes):
             count = spp if passes == 1 else min(per_pass, spp - i * per_pass)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -41,6 +42,10 @@ class Marched:
     def field(self) -> Any:
         """The field."""
         return self.placed.medium.field
+
+    def unbounded(self) -> Marched:
+        """The same field for rays that do not come from a camera: near and far are its."""
+        return replace(self, near=0.0, far=math.inf)
 
     def bounds(self, reach: Any, scale: Any) -> tuple[Any, Any]:
         """Bounds of t in field units: the integrator's or the file's, and ``reach``."""
@@ -195,11 +200,35 @@ class View:
         self.normal = [n * inverse for n in sums]
 
 
+def optical_depth(fields: list[Marched], rays: Rays) -> Any:
+    """Of all fields along R rays, without derivatives: only densities are asked for.
+
+    As opaque as :class:`View` finds them. Densities add up, so nothing has to be merged.
+    """
+    total = dr.zeros(mi.Float, len(rays.o[0]))
+    dr.make_opaque(total)
+    for crossing in _crossings(fields, rays, dr.ADMode.Primal, emission=False):
+        samples, density = crossing.samples, crossing.evaluation.density
+        depth = dr.block_sum(density * samples.delta, samples.count)
+        if crossing.ray is None:
+            total += depth
+        else:
+            dr.scatter_add(total, depth, crossing.ray)
+        dr.eval(total)
+    return total
+
+
 class _Crossing:
     """The samples of one field on the rays that cross its box, and what it answers."""
 
     def __init__(
-        self, number: int, marched: Marched, ray: Any, rays: Rays, mode: dr.ADMode
+        self,
+        number: int,
+        marched: Marched,
+        ray: Any,
+        rays: Rays,
+        mode: dr.ADMode,
+        emission: bool = True,
     ) -> None:
         self.number, self.field, self.ray = number, marched.field, ray
         self.differentiable = mode != dr.ADMode.Primal and marched.differentiable
@@ -228,7 +257,9 @@ class _Crossing:
             if moving:
                 self._move(ray_segments(self.field, o, d, bounds))
         stop = self._march.stop if mode == dr.ADMode.Primal else 0.0
-        self.evaluation = Evaluation(self.field, self.samples, self._march.block, stop=stop)
+        self.evaluation = Evaluation(
+            self.field, self.samples, self._march.block, stop=stop, emission=emission
+        )
 
     def prepare(self, mode: dr.ADMode) -> None:
         """Makes the field's answers the leaves of what is computed next."""
@@ -317,15 +348,17 @@ class _Moving:
             dr.set_grad(leaf, dr.grad(value))
 
 
-def _crossings(fields: list[Marched], rays: Rays, mode: dr.ADMode) -> Iterator[_Crossing]:
+def _crossings(
+    fields: list[Marched], rays: Rays, mode: dr.ADMode, emission: bool = True
+) -> Iterator[_Crossing]:
     """The fields that any of the rays cross."""
     if len(fields) == 1:
-        yield _Crossing(1, fields[0], None, rays, mode)
+        yield _Crossing(1, fields[0], None, rays, mode, emission)
         return
     for number, marched in enumerate(fields, 1):
         ray = mi.UInt32(dr.compress(marched.hit(rays)))
         if len(ray):
-            yield _Crossing(number, marched, ray, rays.take(ray), mode)
+            yield _Crossing(number, marched, ray, rays.take(ray), mode, emission)
 
 
 def _linear(color_space: str, color: list[Any], opacity: Any) -> list[Any]:

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import replace
-from typing import Any, get_args
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from ..errors import InputError
-from ..quadrature import Rule
-from ..volume import MarchSettings
-from .backdrop import Environment, SolidScene, Surfaces, check_nested, has_surfaces
+from .backdrop import Backdrop, Environment, SolidScene, Surfaces, check_nested, has_surfaces
 from .camera import FieldIntegrator
-from .crossing import Marched
-from .placement import PlacedField, find_fields
-from .stage import Stage, StageWave
+from .marching import MarchingIntegrator, traced
+from .placement import find_fields
+from .stage import Stage
 
 
-class NerfIntegrator(FieldIntegrator):
+class NerfIntegrator(MarchingIntegrator):
     r"""
     .. _integrator-nerf:
 
@@ -92,8 +88,8 @@ class NerfIntegrator(FieldIntegrator):
     integrated once (:py:mod:`mi_nerf.merging`). The integral ends exactly at the first
     surface, and the nested integrator's radiance of the ray, weakened by the fields before it,
     is added. The nested integrator does not know the fields: it sees the scene without their
-    cubes, so fields cast no shadows and are missing in mirrors. What is seen through a surface
-    that is not opaque is likewise without fields.
+    cubes, so fields cast no shadows and are missing in mirrors; :monosp:`nerf_path` has both. What
+    is seen through a surface that is not opaque is likewise without fields.
 
     The alpha channel of an RGBA film is the opacity of the fields; with a nested integrator,
     its alpha channel with the fields in front. The colour of a field trained on sRGB images is
@@ -126,24 +122,10 @@ class NerfIntegrator(FieldIntegrator):
     """
 
     plugin = "nerf"
-    known = ("depth", "opacity", "normal", "index")
-    wave = StageWave
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.samples = int(props.get("samples", 0))
-        if self.samples < 0:
-            raise InputError(f"nerf: samples={self.samples}, expected 1 or more")
-        self.rule = props.get("rule", None)
-        if self.rule not in (None, *get_args(Rule)):
-            raise InputError(f"nerf: rule='{self.rule}', expected {' or '.join(get_args(Rule))}")
-        self.stop = props.get("stop", None)
-        if self.stop is not None and not 0 <= self.stop < 1:
-            raise InputError(f"nerf: stop={self.stop}, expected 0 to less than 1")
-        self.jitter = bool(props.get("jitter", True))
-        self.paths = int(props.get("paths", 1))
-        if self.paths < 1:
-            raise InputError(f"nerf: paths={self.paths}, expected 1 or more")
+        self.encoded = bool(props.get("encoded", False))
         self.nested = self._find_nested(props)
         self._solid, self._warned = SolidScene(), False
 
@@ -155,8 +137,10 @@ class NerfIntegrator(FieldIntegrator):
         if len(found) > 1:
             raise InputError(f"nerf: {len(found)} nested integrators, expected at most one")
         for _, nested in found:
-            if isinstance(nested, NerfIntegrator):
-                raise InputError("nerf: nested in 'nerf', expected one like 'path' or 'prb'")
+            if isinstance(nested, FieldIntegrator):
+                raise InputError(
+                    f"nerf: '{nested.plugin}' nested in 'nerf', expected one like 'path' or 'prb'"
+                )
             check_nested(nested)
             return nested
         return None
@@ -170,13 +154,9 @@ class NerfIntegrator(FieldIntegrator):
         """Lists the settings."""
         return (
             "NerfIntegrator[\n"
-            f"  samples = {self.samples or 'from field file'},\n"
-            f"  near = {self.near}, far = {self.far},\n"
-            f"  rule = {self.rule or 'from field file'},\n"
-            f"  stop = {'from field file' if self.stop is None else self.stop},\n"
-            f"  jitter = {self.jitter}, encoded = {self.encoded},\n"
-            f"  aovs = {self.aov_names()},\n"
-            f"  nested = {self.nested}, paths = {self.paths}\n"
+            f"{self._settings()}"
+            f"  encoded = {self.encoded},\n"
+            f"  nested = {self.nested}\n"
             "]"
         )
 
@@ -200,7 +180,7 @@ class NerfIntegrator(FieldIntegrator):
         sensor = self._sensor(scene, sensor)
         with dr.suspend_grad():
             stage = self._stage(scene)
-            waves = list(_traced(stage, self._waves(scene, sensor, seed, spp)))
+            waves = list(traced(stage, self._waves(scene, sensor, seed, spp)))
             with dr.resume_grad():
                 for wave in waves:
                     dr.enable_grad(wave.outputs)
@@ -226,7 +206,7 @@ class NerfIntegrator(FieldIntegrator):
         sensor = self._sensor(scene, sensor)
         with dr.suspend_grad():
             stage = self._stage(scene)
-            waves = list(_traced(stage, self._waves(scene, sensor, seed, spp)))
+            waves = list(traced(stage, self._waves(scene, sensor, seed, spp)))
             for wave in waves:
                 tangents = stage.forward(wave)
                 with dr.resume_grad():
@@ -240,13 +220,6 @@ class NerfIntegrator(FieldIntegrator):
 
     # ---------------------------------- Scene ----------------------------------
 
-    def _draw(self, sampler: mi.Sampler, rays: int, seed: Any) -> Any:
-        """One offset a ray, or ``None``."""
-        return sampler.next_1d() if self.jitter else None
-
-    def _traced(self, scene: mi.Scene, waves: Iterable[StageWave]) -> Iterator[StageWave]:
-        return _traced(self._stage(scene), waves)
-
     def _stage(self, scene: mi.Scene) -> Stage:
         """The scene as it is now."""
         found = find_fields(scene)
@@ -256,28 +229,15 @@ class NerfIntegrator(FieldIntegrator):
                 "nerf: encoded=true with several fields or a nested integrator, expected a "
                 "single field: light mixes in linear radiance"
             )
-        fields = [
-            Marched(placed, self._march(placed), self.near, self.far, encoded) for placed in found
-        ]
-        normals = any(kind == "normal" for _, kind in self.aovs)
-        if normals and any(marched.field.ndc is not None for marched in fields):
-            raise InputError(
-                "nerf: aov 'normal' of a field in normalised device coordinates, expected none"
-            )
-        backdrop: Environment | Surfaces
+        fields = self._marched(found, encoded)
+        normals = self._wants_normals(fields)
+        backdrop: Backdrop
         if self.nested is None:
             self._warn_of_surfaces(scene)
             backdrop = Environment(scene, self.show_background, encoded)
         else:
             backdrop = Surfaces(self._solid.of(scene), self.nested, self.paths, normals)
         return Stage(fields, backdrop, normals)
-
-    def _march(self, placed: PlacedField) -> MarchSettings:
-        march = placed.medium.march
-        samples = self.samples or march.samples
-        stop = march.stop if self.stop is None else self.stop
-        rule = self.rule or march.rule
-        return replace(march, samples=samples, near=None, far=None, rule=rule, stop=stop)
 
     def _warn_of_surfaces(self, scene: mi.Scene) -> None:
         if not self._warned and has_surfaces(scene):
@@ -288,12 +248,6 @@ class NerfIntegrator(FieldIntegrator):
                 "</integrator>",
             )
         self._warned = True
-
-
-def _traced(stage: Stage, waves: Iterable[StageWave]) -> Iterator[StageWave]:
-    for wave in waves:
-        stage.trace(wave)
-        yield wave
 
 
 mi.register_integrator("nerf", NerfIntegrator)

@@ -122,7 +122,7 @@ class NerfMedium(mi.Medium):
     Gradients with respect to the field's pose reach the medium's ``to_world`` and the cube's
     ``vertex_positions``.
 
-    Only the integrators ``nerf`` and ``nerf_tracking`` show it: Mitsuba's own volume
+    Only the integrators ``nerf``, ``nerf_path`` and ``nerf_tracking`` show it: Mitsuba's own volume
     integrators have no notion of emission that depends on direction, and see a vacuum instead.
 
     .. tabs::

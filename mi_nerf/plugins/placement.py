@@ -74,10 +74,13 @@ class PlacedField:
         return _product(_product([row[:3] for row in inverse], change), [*inverse, last])
 
 
-def find_fields(scene: mi.Scene) -> list[PlacedField]:
+def find_fields(scene: mi.Scene, *, least: int = 1) -> list[PlacedField]:
     """The radiance fields of a scene, in the alphabetical order of their cubes' ids.
 
     Cubes that Mitsuba has merged follow each other in their order.
+
+    Args:
+        least: 0 if there need not be any.
 
     Raises:
         InputError: if there is none, one is not in a cube or squashed flat, several include
@@ -102,7 +105,7 @@ def find_fields(scene: mi.Scene) -> list[PlacedField]:
             _check_volume(inner, "the medium's to_world")
             for number, outer in enumerate(cubes_to_world(shape)):
                 found.append(PlacedField(medium, shape, number, outer @ inner))
-    if not found:
+    if len(found) < least:
         raise InputError("nerf: the scene holds no 'nerfmedium', expected at least one, in a cube")
     if len(found) > 1 and any(placed.medium.field.ndc is not None for placed in found):
         raise InputError(

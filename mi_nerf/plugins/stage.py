@@ -8,9 +8,10 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .backdrop import Behind, Environment, Surfaces
+from .backdrop import Backdrop, Behind
 from .camera import Wave
 from .crossing import Marched, Rays, View, chunks
+from .segments import see
 
 
 @dataclass
@@ -61,25 +62,15 @@ class StageWave(Wave):
 class Stage:
     """The fields of a scene and what stands around them, for the time of one rendering."""
 
-    def __init__(self, fields: list[Marched], backdrop: Environment | Surfaces, normals: bool):
+    def __init__(self, fields: list[Marched], backdrop: Backdrop, normals: bool):
         self._fields, self._backdrop, self._normals = fields, backdrop, normals
 
     def trace(self, wave: StageWave) -> None:
         """Fills in what the rays of a pass see, without derivatives."""
-        wave.behind = self._backdrop.look(wave.ray, wave.sampler)
-        count = dr.width(wave.ray)
-        wave.fields = [dr.zeros(mi.Float, count) for _ in range(5)]
-        wave.index = dr.zeros(mi.Float, count)
-        wave.normal = mi.Normal3f(*(dr.zeros(mi.Float, count) for _ in range(3)))
-        dr.make_opaque(wave.fields, wave.index, wave.normal)
-        for index, rays in chunks(self._fields, _rays(wave)):
-            view = View(self._fields, rays, dr.ADMode.Primal, normals=self._normals)
-            for output, value in zip(wave.fields, view.values, strict=True):
-                dr.scatter(output, value, index)
-            dr.scatter(wave.index, view.index, index)
-            if self._normals:
-                dr.scatter(wave.normal, mi.Normal3f(*view.normal), index)
-            dr.eval(wave.fields, wave.index, wave.normal)
+        wave.behind = self._backdrop.meet(wave.ray)
+        seen = see(self._fields, _rays(wave), normals=self._normals)
+        wave.fields, wave.normal, wave.index = seen.values, seen.normal, seen.index
+        self._backdrop.look(wave.behind, wave.ray, wave.sampler, seen.opacity)
 
     def backward(self, wave: StageWave, gradients: list[Any]) -> None:
         """Carries the gradients of a wave's outputs to the parameters of the scene."""

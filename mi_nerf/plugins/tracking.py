@@ -96,6 +96,7 @@ class NerfTrackingIntegrator(FieldIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
+        self.encoded = bool(props.get("encoded", False))
         self.majorant = props.get("majorant", None)
         if self.majorant is not None and not 0 < self.majorant < math.inf:
             raise InputError(
@@ -147,8 +148,9 @@ class NerfTrackingIntegrator(FieldIntegrator):
             segments = ray_segments(tracked, o, d, marched.bounds(wave.ray.maxt, scale))
             block = medium.march.block
             seen = track(tracked, segments, majorants, wave.random, grow=not fixed, block=block)
-            behind = environment.look(wave.ray, wave.sampler).radiance
-            wave.color = over_background(seen.color, seen.opacity, behind)
+            behind = environment.meet(wave.ray)
+            environment.look(behind, wave.ray, wave.sampler, seen.opacity)
+            wave.color = over_background(seen.color, seen.opacity, behind.radiance)
             wave.opacity = seen.opacity
             yield wave
 

@@ -2,6 +2,8 @@
 
     python -m tests.benchmarks.composite
 
+Then what light paths through a field cost, and whether it pays to sample it as a light source.
+
 The field is an untrained network of the size that preset nerf trains, in a ball that fills most
 of its box, so dense that a ray asks it about 28 times: what a rendering costs does not depend
 on what the network shows, but on where it is asked. The scene is a room for Mitsuba's path
@@ -33,7 +35,7 @@ _WIDTH, _PATHS = 256, 64
 
 
 def main() -> None:
-    """Prints both tables."""
+    """Prints all tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--variant")
@@ -45,6 +47,7 @@ def main() -> None:
         file = _field_file(Path(folder))
         _against_none(file, options.repeats)
         _by_number(file, options.repeats)
+        _light_transport(file, options.repeats)
 
 
 def _against_none(file: Path, repeats: int) -> None:
@@ -74,6 +77,41 @@ def _by_number(file: Path, repeats: int) -> None:
             print(
                 f"{count} {name}: {seconds:.3f} s, {queries / 1e6:.2f} million queries, "
                 f"{1e6 * seconds / queries:.3f} s a million"
+            )
+
+
+def _light_transport(file: Path, repeats: int) -> None:
+    """Paths through a field, beside paths that do not know it, and how noisy both are.
+
+    Noise is the mean over all pixels of the variance between renderings; times seconds, it is
+    what a given error costs.
+    """
+    cubes = {"field": _cube(file, mi.ScalarTransform4f().translate([0.2, 0, -0.4]).scale(0.88))}
+    nested = {"type": "nerf", "nested": {"type": "path", "max_depth": 6}}
+    integrators = {
+        "path, without the field": ({"type": "path", "max_depth": 6}, {}),
+        "nerf around path": (nested, cubes),
+        "nerf_path": ({"type": "nerf_path", "max_depth": 6}, cubes),
+        "nerf_path, fields not sampled": (
+            {"type": "nerf_path", "max_depth": 6, "sample_fields": False},
+            cubes,
+        ),
+    }
+    for lit in (True, False):
+        for name, (integrator, fields) in integrators.items():
+            room = _room(integrator, **fields)
+            if not lit:  # by nothing but the field
+                del room["lamp"], room["sky"]
+            if not lit and not fields:
+                continue
+            scene = mi.load_dict(room)
+            seconds, queries = _seconds(scene, 4, repeats)
+            images = [np.array(mi.render(scene, spp=4, seed=100 + i)) for i in range(8)]
+            noise = float(np.var(images, axis=0, ddof=1)[..., :3].mean())
+            print(
+                f"{'lamp and sky' if lit else 'no other light'}, {name}, 4 paths a pixel: "
+                f"{seconds:.3f} s, {queries / 1e6:.2f} million queries, variance {noise:.2e}, "
+                f"times seconds {noise * seconds:.2e}"
             )
 
 

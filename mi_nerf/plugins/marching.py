@@ -1,0 +1,99 @@
+"""What integrators that march through fields have in common: how rays are sampled."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Any, get_args
+
+import mitsuba as mi
+
+from ..errors import InputError
+from ..quadrature import Rule
+from ..volume import MarchSettings
+from .camera import FieldIntegrator
+from .crossing import Marched
+from .placement import PlacedField
+from .stage import Stage, StageWave
+
+
+class MarchingIntegrator(FieldIntegrator):
+    """Shows fields by quadrature, before something else; what that is, is up to subclasses."""
+
+    known = ("depth", "opacity", "normal", "index")
+    wave = StageWave
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.samples = self._integer(props, "samples", 0, least=1)
+        self.rule = props.get("rule", None)
+        if self.rule not in (None, *get_args(Rule)):
+            raise self._unlike("rule", f"'{self.rule}'", " or ".join(get_args(Rule)))
+        self.stop = props.get("stop", None)
+        if self.stop is not None and not 0 <= self.stop < 1:
+            raise self._unlike("stop", self.stop, "0 to less than 1")
+        self.jitter = bool(props.get("jitter", True))
+        self.paths = self._integer(props, "paths", 1, least=1)
+
+    def _integer(self, props: mi.Properties, name: str, default: int, least: int) -> int:
+        """A property that is the default, or no less than a bound."""
+        value = int(props.get(name, default))
+        if value != default and value < least:
+            raise self._unlike(name, value, f"{least} or more")
+        return value
+
+    def _unlike(self, name: str, value: Any, expected: str) -> InputError:
+        return InputError(f"{self.plugin}: {name}={value}, expected {expected}")
+
+    def _settings(self) -> str:
+        """For ``to_string``."""
+        return (
+            f"  samples = {self.samples or 'from field file'},\n"
+            f"  near = {self.near}, far = {self.far},\n"
+            f"  rule = {self.rule or 'from field file'},\n"
+            f"  stop = {'from field file' if self.stop is None else self.stop},\n"
+            f"  jitter = {self.jitter}, paths = {self.paths},\n"
+            f"  aovs = {self.aov_names()},\n"
+        )
+
+    @abstractmethod
+    def _stage(self, scene: mi.Scene) -> Stage:
+        """The scene as it is now."""
+
+    def _draw(self, sampler: mi.Sampler, rays: int, seed: Any) -> Any:
+        """One offset a ray, or ``None``."""
+        return sampler.next_1d() if self.jitter else None
+
+    def _traced(self, scene: mi.Scene, waves: Iterable[StageWave]) -> Iterator[StageWave]:
+        return traced(self._stage(scene), waves)
+
+    def _marched(self, found: list[PlacedField], encoded: bool = False) -> list[Marched]:
+        """The fields of the scene, and how they are sampled."""
+        return [
+            Marched(placed, self._march(placed), self.near, self.far, encoded) for placed in found
+        ]
+
+    def _march(self, placed: PlacedField) -> MarchSettings:
+        march = placed.medium.march
+        samples = self.samples or march.samples
+        stop = march.stop if self.stop is None else self.stop
+        rule = self.rule or march.rule
+        return replace(march, samples=samples, near=None, far=None, rule=rule, stop=stop)
+
+    def _wants_normals(self, fields: list[Marched]) -> bool:
+        """Whether normals are among the channels."""
+        normals = any(kind == "normal" for _, kind in self.aovs)
+        if normals and any(marched.field.ndc is not None for marched in fields):
+            raise InputError(
+                f"{self.plugin}: aov 'normal' of a field in normalised device coordinates, "
+                "expected none"
+            )
+        return normals
+
+
+def traced(stage: Stage, waves: Iterable[StageWave]) -> Iterator[StageWave]:
+    """The waves, filled in with what their rays see."""
+    for wave in waves:
+        stage.trace(wave)
+        yield wave
