@@ -91,6 +91,7 @@ class OptimizerConfig:
     beta1: float = 0.9  # decay of the mean gradient
     beta2: float = 0.99  # decay of the mean squared gradient
     epsilon: float = 1e-8  # added to the root of the latter
+    muon: bool = False  # orthogonal updates of matrices between hidden layers, in place of Adam
 
     def __post_init__(self) -> None:
         require(self, "lr lr_final epsilon", above=0)

@@ -1,5 +1,7 @@
 """Adam (Kingma & Ba 2015) that can decline a step and whose state can be saved.
 
+Matrices between hidden layers may be updated by Muon instead, from the same first moment.
+
 Dr.Jit's own optimizer would serve, but a step with a non-finite gradient must leave
 parameters *and* moments untouched, without the host waiting to find out. So the
 decision is taken on the device.
@@ -15,6 +17,7 @@ import numpy as np
 
 from ..arrays import upload
 from ..network import GRID
+from .orthogonal import is_hidden, orthogonalized, update_size
 
 
 def _choose(mask: Any, a: Any, b: Any) -> Any:
@@ -60,7 +63,9 @@ class Adam:
         beta1: float = 0.9,
         beta2: float = 0.999,
         epsilon: float = 1e-8,
+        muon: bool = False,
     ) -> None:
+        self._muon = muon
         self._parameters = parameters
         self._beta1, self._beta2, self._epsilon = beta1, beta2, epsilon
         self._first = {n: dr.zeros(type(p), p.shape) for n, p in parameters.items()}
@@ -92,7 +97,12 @@ class Adam:
             old, m, v = self._parameters[name], self._first[name], self._second[name]
             m_new = dr.fma(m - g, self._beta1, g)
             v_new = dr.fma(v - dr.square(g), self._beta2, dr.square(g))
-            new = dr.detach(old) - rate * m_new / (dr.sqrt(v_new) + self._epsilon)
+            if self._muon and is_hidden(old.shape):
+                ahead = dr.lerp(g, m_new, self._beta1)  # Nesterov's momentum
+                size = dr.opaque(type(rate), learning_rate * update_size(old.shape))
+                new = dr.detach(old) - size * orthogonalized(ahead)
+            else:
+                new = dr.detach(old) - rate * m_new / (dr.sqrt(v_new) + self._epsilon)
             taken = accept & (g.array != 0) if name.endswith(GRID) else accept
             self._first[name] = _choose(taken, m_new, m)
             self._second[name] = _choose(taken, v_new, v)

@@ -25,7 +25,7 @@ def nerf() -> TrainConfig:
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
         sampling=SamplingConfig(batch=4096),
-        optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3),
+        optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, muon=True),
     )
 
 
@@ -39,7 +39,7 @@ def fast() -> TrainConfig:
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
         sampling=SamplingConfig(batch=16384, hidden=10.0),
-        optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, epsilon=1e-15),
+        optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, epsilon=1e-15, muon=True),
     )
 
 

@@ -185,6 +185,7 @@ class Trainer:
             beta1=options.beta1,
             beta2=options.beta2,
             epsilon=options.epsilon,
+            muon=options.muon,
         )
         self.occupancy = None
         if config.occupancy.enabled:

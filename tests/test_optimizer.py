@@ -1,0 +1,84 @@
+"""Muon's updates against NumPy in double precision, and beside Adam's."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mi_nerf.training.optimizer import Adam
+from mi_nerf.training.orthogonal import is_hidden, orthogonalized, update_size
+
+
+def polynomial(matrix: np.ndarray, rounds: int = 5) -> np.ndarray:
+    """What the iteration does to each singular value of a float64 matrix."""
+    u, s, vt = np.linalg.svd(matrix, full_matrices=False)
+    s = s / np.linalg.norm(matrix)
+    for _ in range(rounds):
+        s = 3.4445 * s - 4.7750 * s**3 + 2.0315 * s**5
+    return (u * s) @ vt
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 2**31), scale=st.floats(-8, 4), shape=st.sampled_from([0, 1, 2]))
+def test_singular_values_go_to_one(ad: Any, seed: int, scale: float, shape: int) -> None:
+    size = [(48, 32), (32, 48), (40, 40)][shape]
+    matrix = np.random.default_rng(seed).normal(size=size) * 10**scale
+    found = np.array(orthogonalized(ad.TensorXf(matrix.astype(np.float32))), float)
+    assert found.shape == size
+    assert np.abs(found - polynomial(matrix)).max() < 2e-3
+    values = np.linalg.svd(found)[1]
+    strong = np.linalg.svd(matrix)[1] > 0.01 * np.linalg.norm(matrix)
+    assert values[strong].min() > 0.6 and values.max() < 1.3
+    assert np.sqrt(np.mean(found**2)) * update_size(size) == pytest.approx(0.2, rel=0.3)
+
+
+def test_nothing_stays_nothing(ad: Any) -> None:
+    zeros = orthogonalized(dr.zeros(ad.TensorXf, (32, 40)))
+    assert np.array_equal(np.array(zeros), np.zeros((32, 40)))
+
+
+def test_thin_matrices_and_vectors_are_left_to_adam() -> None:
+    assert is_hidden((256, 39)) and is_hidden((32, 256))
+    assert not is_hidden((256,)) and not is_hidden((3, 32)) and not is_hidden((32, 15))
+
+
+def quadratic(ad: Any, muon: bool, broken: bool = False) -> tuple[Adam, dict[str, Any]]:
+    rng = np.random.default_rng(1)
+    parameters = {
+        "wide.weight": ad.TensorXf(rng.normal(size=(32, 40)).astype(np.float32)),
+        "thin.weight": ad.TensorXf(rng.normal(size=(3, 40)).astype(np.float32)),
+    }
+    optimizer = Adam(parameters, beta1=0.9, muon=muon)
+    optimizer.zero_grad()
+    loss = sum(dr.sum(dr.square(p), axis=None) for p in parameters.values())
+    dr.backward(loss * (dr.nan if broken else 1))
+    return optimizer, parameters
+
+
+def test_one_step(ad: Any) -> None:
+    """By hand: the first moment is a tenth of the gradient, looked ahead once."""
+    optimizer, parameters = quadratic(ad, muon=True)
+    before = {n: np.array(p, float) for n, p in parameters.items()}
+    assert optimizer.step(0.01, ad.Bool(True))[0]
+    gradient = 2 * before["wide.weight"]
+    step = 0.01 * 0.2 * np.sqrt(40) * polynomial(0.1 * gradient + 0.9 * 0.1 * gradient)
+    found = np.array(parameters["wide.weight"], float)
+    assert np.abs(found - (before["wide.weight"] - step)).max() < 1e-4
+    other, plain = quadratic(ad, muon=False)
+    other.step(0.01, ad.Bool(True))
+    assert np.array_equal(np.array(parameters["thin.weight"]), np.array(plain["thin.weight"]))
+    assert not np.allclose(found, np.array(plain["wide.weight"]))
+
+
+def test_a_step_that_is_not_finite_changes_nothing(ad: Any) -> None:
+    optimizer, parameters = quadratic(ad, muon=True, broken=True)
+    before = {n: np.array(p) for n, p in parameters.items()}
+    assert not optimizer.step(0.01, ad.Bool(True))[0]
+    for name, value in before.items():
+        assert np.array_equal(np.array(parameters[name]), value)
+    assert all(np.isfinite(v).all() for v in optimizer.state().values())
