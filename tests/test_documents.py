@@ -330,7 +330,7 @@ def test_settings_named_in_the_text_exist() -> None:
                     seen += 1
                     assert key in known, f"{page.name}: {key}"
                     if value and not is_placeholder(value) and value != "…":
-                        with_settings(preset("paper"), [part])
+                        with_settings(preset("nerf"), [part])
     assert seen > 20
 
 

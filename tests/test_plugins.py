@@ -194,11 +194,11 @@ def test_seed_and_spp(variant: str, field: Path) -> None:
 def test_passes_of_bounded_size_agree(
     variant: str, field: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import mi_nerf.plugins.camera as camera
+    from mi_nerf.plugins.camera import FieldIntegrator
 
     scene = mi.load_dict(scene_dict(field))
     whole = np.array(mi.render(scene, spp=512))
-    monkeypatch.setattr(camera, "_RAYS_PER_PASS", 16 * 12 * 100)
+    monkeypatch.setattr(FieldIntegrator, "rays_per_pass", 16 * 12 * 100)
     np.testing.assert_allclose(np.array(mi.render(scene, spp=512)), whole, atol=0.02)
 
 
