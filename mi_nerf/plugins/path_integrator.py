@@ -39,9 +39,9 @@ class NerfPathIntegrator(MarchingIntegrator):
      * - sample_fields
        - |bool|
        - At matt and glossy surfaces, sample directions towards the fields besides those that
-         the surface prefers and those of the scene's lights. Worth its time where fields
-         light up their surroundings; where they hardly do, ``false`` saves it. The mean is the
-         same. (Default: true)
+         the surface prefers and those of the scene's lights. Worth its time where fields are
+         the lamps; among other lights a path costs several times as much and is hardly less
+         noisy. The mean is the same. (Default: false)
      * - paths
        - |int|
        - Paths that go on behind the fields for every camera ray. (Default: 1)
@@ -77,11 +77,12 @@ class NerfPathIntegrator(MarchingIntegrator):
     A scene without fields looks as :monosp:`path` shows it.
 
     Light sources are sampled as in :monosp:`path`, and the light that arrives is weakened by the
-    fields between; only their densities are asked for that. Light from fields is found in two
-    ways, combined by multiple importance sampling (Veach and Guibas 1995): by the directions that
-    the surface's BSDF prefers, and by directions towards points spread evenly in the box around
-    the occupied cells of a field (:py:mod:`mi_nerf.plugins.field_light`). Fields in normalised
-    device coordinates have no such box: only the first of these finds them.
+    fields between; only their densities are asked for that. Light from fields is found by the
+    directions that the surface's BSDF prefers and, with ``sample_fields``, also by directions
+    towards points spread evenly in the box around the occupied cells of a field
+    (:py:mod:`mi_nerf.plugins.field_light`), combined by multiple importance sampling (Veach and
+    Guibas 1995). Fields in normalised device coordinates have no such box: only the first of
+    these finds them.
 
     The estimate is without bias apart from the quadrature along each segment, which is that of
     :monosp:`nerf`. All light is linear: on every segment, a field trained on sRGB images is
@@ -116,7 +117,7 @@ class NerfPathIntegrator(MarchingIntegrator):
         super().__init__(props)
         if props.get("max_depth", -1) < 0:  # the base class has a default of its own
             self.max_depth = _UNLIMITED
-        self.sample_fields = bool(props.get("sample_fields", True))
+        self.sample_fields = bool(props.get("sample_fields", False))
         self._solid = SolidScene()
 
     def to_string(self) -> str:

@@ -92,8 +92,8 @@ def _light_transport(file: Path, repeats: int) -> None:
         "path, without the field": ({"type": "path", "max_depth": 6}, {}),
         "nerf around path": (nested, cubes),
         "nerf_path": ({"type": "nerf_path", "max_depth": 6}, cubes),
-        "nerf_path, fields not sampled": (
-            {"type": "nerf_path", "max_depth": 6, "sample_fields": False},
+        "nerf_path, fields sampled": (
+            {"type": "nerf_path", "max_depth": 6, "sample_fields": True},
             cubes,
         ),
     }
