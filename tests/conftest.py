@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import pytest
 from hypothesis import settings
 
@@ -29,6 +30,18 @@ def ad(request: pytest.FixtureRequest) -> Any:
     if not dr.has_backend(getattr(dr.JitBackend, request.param.upper())):
         pytest.skip(f"no {request.param} on this machine")
     return import_module(f"drjit.{request.param}.ad")
+
+
+@pytest.fixture(
+    params=["llvm_ad_rgb", pytest.param("cuda_ad_rgb", marks=pytest.mark.cuda)],
+)
+def variant(request: pytest.FixtureRequest) -> str:
+    """One of Mitsuba's variants, which is set."""
+    backend = request.param.split("_")[0].upper()
+    if not dr.has_backend(getattr(dr.JitBackend, backend)):
+        pytest.skip(f"no {request.param} on this machine")
+    mi.set_variant(request.param)
+    return str(request.param)
 
 
 # ---- The command line --------------------------------------------------------

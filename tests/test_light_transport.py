@@ -31,16 +31,7 @@ from tests.composed import (
 )
 from tests.fields import formula_dict, small_file
 
-VARIANTS = ["llvm_ad_rgb", pytest.param("cuda_ad_rgb", marks=pytest.mark.cuda)]
-
-
-@pytest.fixture(params=VARIANTS, autouse=True)
-def variant(request: pytest.FixtureRequest) -> str:
-    backend = request.param.split("_")[0].upper()
-    if not dr.has_backend(getattr(dr.JitBackend, backend)):
-        pytest.skip(f"no {request.param} on this machine")
-    mi.set_variant(request.param)
-    return request.param
+pytestmark = pytest.mark.usefixtures("variant")
 
 
 def paths(**options: Any) -> dict[str, Any]:

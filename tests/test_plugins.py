@@ -16,17 +16,6 @@ from mi_nerf.color import srgb_to_linear
 from mi_nerf.plugins.placement import cubes_to_world
 from tests.fields import scene_dict, small_file, weight_keys
 
-VARIANTS = ["llvm_ad_rgb", pytest.param("cuda_ad_rgb", marks=pytest.mark.cuda)]
-
-
-@pytest.fixture(params=VARIANTS)
-def variant(request: pytest.FixtureRequest) -> str:
-    backend = request.param.split("_")[0].upper()
-    if not dr.has_backend(getattr(dr.JitBackend, backend)):
-        pytest.skip(f"no {request.param} on this machine")
-    mi.set_variant(request.param)
-    return request.param
-
 
 @pytest.fixture
 def field(tmp_path: Path) -> Path:
