@@ -39,7 +39,7 @@ def fast() -> TrainConfig:
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
         sampling=SamplingConfig(batch=16384, hidden=10.0),
-        optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, epsilon=1e-15, muon=True),
+        optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, epsilon=1e-15),
     )
 
 
