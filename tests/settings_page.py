@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mi_nerf.training.config import TrainConfig, to_json
-from mi_nerf.training.plain import as_text
+from mi_nerf.training.plain import as_text, leaves
 from mi_nerf.training.presets import PRESETS
 
 PAGE = Path(__file__).parent.parent / "docs" / "settings.md"
@@ -53,8 +53,8 @@ def _group(settings: Any, prefix: str) -> list[str]:
 
 def _presets() -> list[str]:
     """What presets set otherwise than the defaults."""
-    usual = dict(_leaves(to_json(TrainConfig())))
-    found = {name: dict(_leaves(to_json(make()))) for name, make in PRESETS.items()}
+    usual = dict(leaves(to_json(TrainConfig())))
+    found = {name: dict(leaves(to_json(make()))) for name, make in PRESETS.items()}
     names = [n for preset in found.values() for n, v in preset.items() if v != usual.get(n, None)]
     names = [n for n in dict.fromkeys(names) if n != "preset"]
     lines = ["", "## Presets", "", "Settings in which a preset differs from the defaults.", ""]
@@ -68,16 +68,6 @@ def _presets() -> list[str]:
 
 def _cell(value: Any) -> str:
     return as_text(value, "g") if value != "–" else value
-
-
-def _leaves(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    found: list[tuple[str, Any]] = []
-    for name, value in values.items():
-        if isinstance(value, dict):
-            found += _leaves(value, f"{prefix}{name}.")
-        else:
-            found.append((prefix + name, value))
-    return found
 
 
 def _comments(cls: Any) -> dict[str, str]:

@@ -22,14 +22,14 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
 from ..data import Dataset
 from . import probes
 from .config import TrainConfig, to_json, with_settings
-from .plain import as_text
+from .plain import as_text, leaves
 from .presets import nerf, preset
 from .probes import Probe, Probes
 from .trainer import Trainer, carved_cells, field_config, resolved_octaves
@@ -312,13 +312,5 @@ def _report(shape: tuple[int, int], probe: Probe) -> str:
 
 def _changed(config: TrainConfig) -> set[str]:
     """Names of the settings in which ``config`` differs from its preset."""
-    found, usual = (dict(_leaves(to_json(c))) for c in (config, preset(config.preset)))
+    found, usual = (dict(leaves(to_json(c))) for c in (config, preset(config.preset)))
     return {name for name, value in found.items() if name not in usual or value != usual[name]}
-
-
-def _leaves(values: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, dict):
-            yield from _leaves(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

@@ -10,6 +10,7 @@ import dataclasses
 import math
 import types
 import typing
+from collections.abc import Iterator
 from typing import Any, Literal
 
 
@@ -87,6 +88,15 @@ def as_text(value: Any, form: str = "") -> str:
     if isinstance(value, float):
         return format(value, form)
     return "none" if value is None else str(value).lower()
+
+
+def leaves(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The plain values of nested dictionaries, each with its dotted name."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from leaves(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def leaf_names(cls: Any, prefix: str = "") -> list[str]:

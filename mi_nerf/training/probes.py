@@ -11,9 +11,9 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
-from tqdm import tqdm
 
 from ..arrays import vector3_type
+from ..bars import progress_bar
 from ..data import Dataset
 from ..field import NeuralField
 from .batches import RaySource, step_rng
@@ -123,8 +123,7 @@ class Probes:
         pixels = self._pixels(trainer)
         durations: list[float] = []
         halfway, previous = math.nan, None
-        bar = tqdm(total=goal, desc=_title(config), unit="step", leave=False, disable=None)
-        with bar:
+        with progress_bar(_title(config), "step", goal, leave=False) as bar:
             while trainer.step_count < goal:
                 begin = self._clock()
                 result = trainer.step(learning_rate(config.optimizer, 0.0, trainer.step_count))
