@@ -14,7 +14,7 @@ from . import network
 from .activations import ColorActivation, DensityActivation, apply_activation
 from .arrays import upload, vector3_type
 from .encoding import FourierEncoding, stack_rows
-from .fused_network import FusedNetwork, worth_fusing
+from .fused_network import FusedNetwork, HalfNetwork, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
 from .ndc import Ndc
 from .network import NetworkConfig
@@ -152,6 +152,7 @@ class NeuralField:
 
     coarse: NeuralField | None = None  # says where this one is worth sampling (Sec. 5.2)
     noise: DensityNoise | None = None  # added to raw densities, in training
+    loss_scale: Any = None  # one value: emission is asked in half precision, in training
 
     def __init__(
         self,
@@ -200,6 +201,8 @@ class NeuralField:
     def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
         """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
         config = self.config
+        if self.loss_scale is not None:
+            return self._answer(HalfNetwork(config.network, self._weights, self.loss_scale), p, d)
         h = self._trunk(p)
         with stage("encoding"):
             direction = settled(config.direction(d)) if config.network.view_dependent else None
@@ -217,14 +220,18 @@ class NeuralField:
         fused = FusedNetwork(config.network, self._weights)
 
         def density_emission(p: Any, d: Any) -> tuple[Any, list[Any]]:
-            direction = config.direction.features(d) if config.network.view_dependent else None
-            density, color = fused(self._features(p), direction)
-            return self._density(density, p), self._color(color)
+            return self._answer(fused, p, d)
 
         def density(p: Any) -> Any:
             return self._density(fused.density(self._features(p)), p)
 
         return density_emission if emission else density
+
+    def _answer(self, fused: FusedNetwork, p: Any, d: Any) -> tuple[Any, list[Any]]:
+        config = self.config
+        direction = config.direction.features(d) if config.network.view_dependent else None
+        density, color = fused(self._features(p), direction)
+        return self._density(density, p), self._color(color)
 
     def _trunk(self, p: Any) -> Any:
         with stage("encoding"):

@@ -221,6 +221,7 @@ def test_fourier_features_where_they_learn_more(script: Any) -> None:
     config, decisions, _ = script(answers)
     assert config.grid is None and config.position is None
     assert config.network.width == 256 and config.sampling.hidden == 0
+    assert config.optimizer.muon  # as in the preset whose network it is
     assert chosen(decisions)["grid"] is None
     config, decisions, _ = script({**answers, "fourier": probe(29.0)})
     assert config.grid is not None and chosen(decisions)["grid.levels"] == 8

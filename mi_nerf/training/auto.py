@@ -300,6 +300,7 @@ def _settle_fourier(choice: _Settings, why: str) -> None:
         choice.take(f"network.{name}", getattr(network, name), why)
     for name in ("batch", "hidden"):
         choice.take(f"sampling.{name}", getattr(model.sampling, name), why)
+    choice.take("optimizer.muon", model.optimizer.muon, why)
 
 
 def _shape(depth: int, width: int) -> list[str]:

@@ -28,6 +28,8 @@ def save_checkpoint(path: str | Path, trainer: Trainer, progress: dict[str, Any]
     arrays |= {f"adam.{n}": a for n, a in trainer.optimizer.state().items()}
     if trainer.occupancy is not None:
         arrays |= {f"occupancy.{n}": a for n, a in trainer.occupancy.state().items()}
+    if trainer.loss_scale is not None:
+        arrays["loss_scale"] = trainer.loss_scale.state()
     description = {
         "step": trainer.step_count,
         "attempt": trainer.attempt,
@@ -59,6 +61,8 @@ def load_checkpoint(path: str | Path, trainer: Trainer) -> dict[str, Any]:
         trainer.optimizer.restore(prefixed(arrays, "adam."))
         if trainer.occupancy is not None:
             trainer.occupancy.restore(prefixed(arrays, "occupancy."))
+        if trainer.loss_scale is not None:
+            trainer.loss_scale.restore(arrays["loss_scale"])
         trainer.step_count = description["step"]
         trainer.rays_per_step = description["rays_per_step"]
         progress: dict[str, Any] = description["progress"]

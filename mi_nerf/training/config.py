@@ -11,6 +11,7 @@ from typing import Any, Literal
 from ..activations import ColorActivation, DensityActivation
 from ..encoding import FourierEncoding
 from ..errors import InputError
+from ..fused_network import WIDEST
 from ..hash_grid import HashGridConfig
 from ..network import NetworkConfig
 from ..quadrature import Rule
@@ -133,6 +134,7 @@ class TrainConfig:
     crop: float = 0.5  # share of width and height that they see
     max_skipped: int = 20  # non-finite steps in a row that end the run
     store_activations: float = 3.0  # GiB of activations; larger steps are taken in parts
+    half_precision: bool = False  # of the network in training, for GPUs; slower on CPUs
 
     def __post_init__(self) -> None:
         require(self, "seed", at_least=0, below=1 << 31)
@@ -142,6 +144,11 @@ class TrainConfig:
         require(self, "crop", above=0, at_most=1)
         require(self, "collapse_check max_restarts", at_least=0)
         require(self, "store_activations", above=0)
+        widest = max(self.network.width, self.network.view_width)
+        if self.half_precision and widest > WIDEST:
+            raise ValueError(
+                f"half_precision=true with {widest} neurons a layer, expected {WIDEST} at most"
+            )
         box = self.box or (0, 0, 0, 1, 1, 1)
         if not all(box[i] < box[i + 3] for i in range(3)):
             raise ValueError(f"box={self.box}, expected three minima below three maxima")

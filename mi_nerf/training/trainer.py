@@ -31,6 +31,7 @@ from ..volume import (
 )
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
+from .loss_scale import LossScale
 from .losses import LOSSES, squared_error
 from .optimizer import Adam, JointParameters
 
@@ -187,6 +188,7 @@ class Trainer:
             epsilon=options.epsilon,
             muon=options.muon,
         )
+        self.loss_scale = LossScale(self._backend.Float) if config.half_precision else None
         self.occupancy = None
         if config.occupancy.enabled:
             self.occupancy = OccupancyGrid(
@@ -222,7 +224,7 @@ class Trainer:
             fine_jitter = rng.random(float_type, rays * fine) if fine else float_type()
             dr.eval(jitter, fine_jitter)
         self.optimizer.zero_grad()
-        with self._noise():
+        with self._networks_in_training():
             parts = [
                 self._differentiate(batch.part(*part), part, rays, jitter, fine_jitter)
                 for part in self._parts(rays)
@@ -230,6 +232,8 @@ class Trainer:
         loss, mse, counted = (sum(v[1:], v[0]) for v in list(zip(*parts, strict=True))[:3])
         with stage("optimizer"):
             accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
+            if self.loss_scale is not None:
+                self.loss_scale.update(accepted)
         self.step_count += 1
         self._adapt_rays(rays, sum(part[4] for part in parts))
         with stage("occupancy"):
@@ -261,17 +265,19 @@ class Trainer:
             yield start, min(size, rays - start)
 
     @contextmanager
-    def _noise(self) -> Iterator[None]:
-        """Regularises the densities of real captures (NeRF, appendix A)."""
+    def _networks_in_training(self) -> Iterator[None]:
+        """Noise on the densities of real captures (NeRF, appendix A), and half precision."""
         networks = [f for f in (self.field, self.field.coarse) if f is not None]
         for k, network in enumerate(networks):
+            if self.loss_scale is not None:
+                network.loss_scale = self.loss_scale.value
             if self._noise_level > 0:
                 network.noise = DensityNoise(self._noise_level, 2 * self.step_count + k)
         try:
             yield
         finally:
             for network in networks:
-                network.noise = None
+                network.noise = network.loss_scale = None
 
     def _differentiate(
         self, batch: RayBatch, part: tuple[int, int], rays: int, jitter: Any, fine_jitter: Any
