@@ -20,7 +20,7 @@ from .hash_grid import HashGridConfig
 from .tensor_file import read_metadata, read_tensors
 from .training import checkpoint
 from .training.auto import Decision
-from .training.run import CHECKPOINT, CONFIG, FIELD, read_config
+from .training.run_folder import CHECKPOINT, CONFIG, FIELD, read_config
 
 
 def system() -> str:

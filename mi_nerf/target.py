@@ -9,7 +9,7 @@ from typing import Any
 
 from .errors import InputError
 from .field_file import FieldFile, load_field
-from .training.run import CONFIG, FIELD, LOG, read_config
+from .training.run_folder import CONFIG, FIELD, LOG, read_config
 
 
 @dataclass(frozen=True)

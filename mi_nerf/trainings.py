@@ -12,7 +12,8 @@ from .errors import InputError
 from .files import read_json, write_json
 from .training import run as training
 from .training.config import TrainConfig, from_json
-from .training.run import CONFIG, Run, TrainingError
+from .training.run import Run, TrainingError
+from .training.run_folder import CONFIG
 
 RESULT = "eval.json"
 

@@ -26,6 +26,7 @@ from .training.config import TrainConfig, with_settings
 from .training.plain import as_text
 from .training.presets import preset as preset_config
 from .training.run import Run
+from .training.run_folder import CONFIG, read_config
 from .views import Image
 
 Settings = Mapping[str, Any] | Sequence[str]
@@ -156,7 +157,7 @@ def start(
             config = replace(config, **{name: positive(name.replace("_", "-"), value)})
     if not resume and config.steps is None and config.max_seconds is None:
         config = replace(config, max_seconds=600.0)
-    if resume and (Path(out) / training.CONFIG).exists():
+    if resume and (Path(out) / CONFIG).exists():
         _require_same_settings(Path(out), config, assignments)
     return training.start(
         data,
@@ -279,7 +280,7 @@ def _assignments(settings: Settings) -> list[str]:
 
 def _require_same_settings(folder: Path, given: TrainConfig, assignments: list[str]) -> None:
     """Refuses options that a resumed run, which keeps its settings, would ignore."""
-    recorded, _ = training.read_config(folder)
+    recorded, _ = read_config(folder)
     wanted = with_settings(recorded, assignments)
     usual = TrainConfig()
     for name in ("preset", "seed", "downscale"):

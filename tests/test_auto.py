@@ -29,6 +29,7 @@ from mi_nerf.training.auto import (
 from mi_nerf.training.config import TrainConfig, with_settings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.probes import Probe, Probes
+from mi_nerf.training.run_folder import read_config
 from mi_nerf.training.trainer import Trainer, resolved_octaves
 from tests.datasets import blob_images, orbit_poses, write_blender_dataset
 
@@ -378,7 +379,7 @@ def test_a_run_records_and_shows_its_reasons(
     options = ["--preset", "auto", "--steps", "3", "--set", *SMALL]
     assert main(["train", str(diffuse.path), "--out", str(out), *options]) == 0
     said = capsys.readouterr().out
-    config, record = training.read_config(out)
+    config, record = read_config(out)
     assert config.preset == "auto" and config.grid.finest == 32 and config.network.width == 32
     settings = [entry["setting"] for entry in record["auto"]]
     assert "box" in settings and "network.view_dependent" in settings

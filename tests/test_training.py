@@ -28,6 +28,7 @@ from mi_nerf.training.batches import step_rng
 from mi_nerf.training.config import OptimizerConfig, TrainConfig, with_settings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.run import TrainingError
+from mi_nerf.training.run_folder import read_config
 from mi_nerf.training.schedule import learning_rate
 from mi_nerf.training.trainer import Trainer, resolved_octaves
 from mi_nerf.volume import Evaluation, integrate, place_samples, refine, render_rays
@@ -195,6 +196,14 @@ def test_too_many_skipped_steps_end_the_run(data: Path, tmp_path: Path) -> None:
         run.train(show_bar=False)
 
 
+def test_steps_without_a_whole_ray_end_the_run(data: Path, tmp_path: Path) -> None:
+    """The coarse network leaves nothing of so small a batch to the fine one."""
+    config = small("sampling.rays=64", "sampling.batch=24", "sampling.fine=8", max_skipped=5)
+    run = training.start(data, tmp_path / "run", replace(config, steps=100), "llvm_ad_rgb")
+    with pytest.raises(TrainingError, match="no ray kept all .* in 5 steps .*sampling.batch"):
+        run.train(show_bar=False)
+
+
 def test_a_collapsed_run_restarts_and_says_so(data: Path, tmp_path: Path) -> None:
     config = small(
         "density.activation=relu",
@@ -252,7 +261,7 @@ def test_a_run_folder_holds_what_it_should(data: Path, tmp_path: Path) -> None:
     line = json.loads((tmp_path / "run/log.jsonl").read_text().splitlines()[-1])
     assert {"step", "seconds", "loss", "psnr", "samples_per_ray", "learning_rate"} <= set(line)
     assert line["step"] == 20
-    config, record = training.read_config(tmp_path / "run")
+    config, record = read_config(tmp_path / "run")
     assert config == run.config and record["versions"]["mitsuba"]
 
 

@@ -15,7 +15,7 @@ import pytest
 
 import mi_nerf
 from mi_nerf.cli import main
-from mi_nerf.training.run import read_config
+from mi_nerf.training.run_folder import read_config
 
 SMALL = {
     "network.width": 16,

@@ -19,7 +19,8 @@ from ..machine import machine
 from ..target import Target
 from ..training.config import TrainConfig, setting_names, to_json, with_settings
 from ..training.presets import preset
-from ..training.run import CONFIG, Run
+from ..training.run import Run
+from ..training.run_folder import CONFIG
 from ..trainings import check_same, mean, trained
 
 Record = dict[str, Any]

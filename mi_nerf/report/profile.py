@@ -18,7 +18,7 @@ from ..files import replacing
 from ..stages import Launch, recording
 from ..target import Target
 from ..training.checkpoint import load_checkpoint
-from ..training.run import CHECKPOINT, read_config
+from ..training.run_folder import CHECKPOINT, read_config
 from ..training.trainer import Trainer
 from .arithmetic import drjit_product_rate, numpy_product_rate, training_flop
 

@@ -132,7 +132,7 @@ class TrainConfig:
     max_restarts: int = 3  # after a collapse, each with other weights
     crop_steps: int = 0  # so many first steps see only the middle of the images
     crop: float = 0.5  # share of width and height that they see
-    max_skipped: int = 20  # non-finite steps in a row that end the run
+    max_skipped: int = 20  # steps in a row, not finite or without a whole ray, that end the run
     store_activations: float = 3.0  # GiB of activations; larger steps are taken in parts
     half_precision: bool = False  # of the network in training, for GPUs; slower on CPUs
 

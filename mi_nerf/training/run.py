@@ -22,23 +22,17 @@ from ..cameras import Intrinsics
 from ..data import Dataset, load_dataset
 from ..errors import InputError
 from ..field_file import FieldFile, save_field
-from ..files import check_folder, make_folder, read_json, write_json
+from ..files import check_folder, make_folder, write_json
 from ..interrupts import interruptible
 from ..views import Image, View, display_image, render_view
 from ..volume import MarchSettings
 from .auto import Choice, Decision, choose
 from .checkpoint import load_checkpoint, save_checkpoint
-from .config import TrainConfig, from_json, to_json
+from .config import TrainConfig, to_json
 from .progress import Meter, ProgressBar
+from .run_folder import CHECKPOINT, CONFIG, FIELD, LOG, cut_log, read_config
 from .schedule import learning_rate
 from .trainer import StepResult, Trainer
-
-CONFIG, CHECKPOINT, FIELD, LOG = (
-    "config.json",
-    "checkpoint.safetensors",
-    "field.safetensors",
-    "log.jsonl",
-)
 
 
 class TrainingError(RuntimeError):
@@ -73,7 +67,7 @@ class Run:
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before the clock was last started
         self._skipped = 0
-        self._skipped_in_row = 0
+        self._skipped_in_row = self._without_rays = 0
         self._attempt_start = 0
         self._begun = self.trainer.step_count  # before the log began
         self._since = Meter()
@@ -109,7 +103,7 @@ class Run:
             raise InputError(
                 f"{self.folder / CHECKPOINT}: damaged description of the progress: {error}"
             ) from error
-        _cut_log(self.folder / LOG, self.trainer.step_count)
+        cut_log(self.folder / LOG, self.trainer.step_count)
 
     def train(
         self, show_bar: bool = True, after_step: Callable[[Run], object] | None = None
@@ -277,6 +271,7 @@ class Run:
             mse = float(result.mse[0])
             self._since.add(float(result.loss[0]), mse, result)
             self._recent.append(mse)
+            self._count_without_rays(int(result.rays[0]))
             return
         self._skipped += 1
         self._skipped_in_row += 1
@@ -284,6 +279,15 @@ class Run:
             raise TrainingError(
                 f"loss or gradient not finite in {self._skipped_in_row} steps in a row at step "
                 f"{self.trainer.step_count}; try a smaller optimizer.lr"
+            )
+
+    def _count_without_rays(self, rays: int) -> None:
+        """Steps of which nothing can be learnt are not taken for ever."""
+        self._without_rays = 0 if rays else self._without_rays + 1
+        if self._without_rays >= self.config.max_skipped:
+            raise TrainingError(
+                f"no ray kept all of its samples in {self._without_rays} steps in a row at step "
+                f"{self.trainer.step_count}; try a larger sampling.batch or fewer sampling.rays"
             )
 
     # ---------------------------------- Collapse ----------------------------------
@@ -380,22 +384,6 @@ def start(
     return run
 
 
-def read_config(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:
-    """The configuration of a run, and all that ``config.json`` records.
-
-    Raises:
-        InputError: if it is missing or not of this version.
-    """
-    path = folder / CONFIG
-    record = read_json(path, "the config.json of a run")
-    if not isinstance(record, dict) or "settings" not in record:
-        raise InputError(f"{path}: no 'settings', expected the config.json of a run")
-    data = record.get("data")
-    if not isinstance(data, dict) or not {"path", "views", "size"} <= data.keys():
-        raise InputError(f"{path}: no 'data', expected the config.json of a run")
-    return from_json(record["settings"], str(path)), record
-
-
 def _resumed_config(folder: Path, given: TrainConfig, data: str | Path) -> TrainConfig:
     config, record = read_config(folder)
     recorded = record["data"]["path"]
@@ -435,17 +423,3 @@ def _record(run: Run, dataset: Dataset) -> dict[str, Any]:
             "python": platform.python_version(),
         },
     }
-
-
-def _cut_log(path: Path, step: int) -> None:
-    """Drops lines of steps that the checkpoint has not seen."""
-    if not path.exists():
-        return
-    kept = []
-    for line in path.read_text().splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line)
-        except (ValueError, KeyError):  # a line cut short when the run was killed
-            continue
-    path.write_text("".join(line + "\n" for line in kept))

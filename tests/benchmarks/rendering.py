@@ -29,6 +29,7 @@ from mi_nerf.metrics import psnr, to_8bit
 from mi_nerf.occupancy import OccupancyGrid
 from mi_nerf.training import run as training
 from mi_nerf.training.presets import preset
+from mi_nerf.training.run_folder import FIELD
 from mi_nerf.views import display_image, render_view
 from tests.benchmarks import data_folder, machine
 
@@ -53,7 +54,7 @@ def main() -> None:
         run = training.start(data, Path(folder) / "run", config, variant)
         run.train(show_bar=False)
         _quality(run, data, options.views)
-        _speed(Path(folder) / "run" / training.FIELD, data, options.repeats)
+        _speed(Path(folder) / "run" / FIELD, data, options.repeats)
 
 
 def _quality(run: training.Run, data: Path, views: int) -> None:

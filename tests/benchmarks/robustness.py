@@ -32,6 +32,7 @@ from mi_nerf.target import open_target
 from mi_nerf.training import run as training
 from mi_nerf.training.config import with_settings
 from mi_nerf.training.presets import preset
+from mi_nerf.training.run_folder import LOG
 from tests.benchmarks import machine
 
 RESULTS = "results.json"
@@ -92,7 +93,7 @@ def _outcome(
         run.train(show_bar=False)
     except training.TrainingError as problem:
         error = str(problem)
-    log = [json.loads(line) for line in (folder / training.LOG).read_text().splitlines()]
+    log = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
     result = {
         "steps": run.trainer.step_count,
         "restarts": sum(line.get("event") == "restart" for line in log),
