@@ -38,8 +38,10 @@ from .sampling import (
 )
 from .stages import stage
 
-# Samples of each ray that are evaluated before it is first asked whether the ray goes on.
-_FIRST_ROUND = 4
+# Before it is asked which rays go on, so many samples of each are evaluated, or more where
+# that makes less than so many queries.
+_LEAST_OF_RAY = 4
+_LEAST_QUERIES = 1 << 14
 
 # Numbers in the copies of a gradient that threads may have for themselves, together.
 _PRIVATE_NUMBERS = 1 << 26
@@ -316,28 +318,41 @@ class Evaluation:
     def _front_to_back(self, stop: float) -> Iterator[Any]:
         """Indices of the samples to ask for next, as long as any ray goes on.
 
-        Each round looks at twice as many samples of every ray as the one before.
+        Each round looks at a few more samples of every ray that goes on, and at more of them
+        when few rays are left.
         """
-        samples, float_type = self._samples, type(self._samples.t)
-        uint = type(samples.index)
-        pending = samples.index
-        if not len(pending):
+        samples, index = self._samples, self._samples.index
+        float_type, uint = type(samples.t), type(index)
+        if not len(index):
             return
-        limit = dr.opaque(float_type, -math.log(stop))
-        rank = _rank_in_ray(pending // samples.count, samples.rays)
-        size, start = _FIRST_ROUND, 0
-        while len(pending):
-            turn = rank < dr.opaque(uint, start + size)
-            chosen, later = dr.compress(turn), dr.compress(~turn)
-            yield dr.gather(uint, pending, chosen)
-            pending, rank = (dr.gather(uint, v, later) for v in (pending, rank))
-            start, size = start + size, 2 * size
-            if not len(pending):
-                return
-            depth = dr.block_sum(self.density * samples.delta, samples.count)
-            alive = dr.compress(dr.gather(float_type, depth, pending // samples.count) < limit)
-            pending, rank = (dr.gather(uint, v, alive) for v in (pending, rank))
-            dr.eval(pending, rank)
+        limit, delta = dr.opaque(float_type, -math.log(stop)), dr.detach(samples.delta)
+        first, number = _spans(index // samples.count, samples.rays)
+        ray = uint(dr.compress(number > 0))
+        depth, seen = dr.zeros(float_type, len(ray)), 0
+        dr.make_opaque(depth)
+        while len(ray):
+            size = self._round_size(len(ray))
+            lane = dr.arange(uint, len(ray) * size)
+            place = lane % size + dr.opaque(uint, seen)
+            own = dr.gather(uint, ray, lane // size)
+            there = place < dr.gather(uint, number, own)
+            sample = dr.gather(uint, index, dr.gather(uint, first, own) + place, there)
+            dr.eval(sample, there)
+            yield dr.gather(uint, sample, dr.compress(there))
+            width = dr.gather(float_type, delta, sample, there)
+            tau = dr.gather(float_type, self.density, sample, there) * width
+            depth, seen = depth + dr.block_sum(tau, size), seen + size
+            more = dr.gather(uint, number, ray) > dr.opaque(uint, seen)
+            alive = dr.compress((depth < limit) & more)
+            ray, depth = dr.gather(uint, ray, alive), dr.gather(float_type, depth, alive)
+            dr.eval(ray, depth)
+
+    def _round_size(self, rays: int) -> int:
+        """Samples of each of so many rays to ask for at once: a power of two."""
+        size = _LEAST_OF_RAY
+        while size * rays < _LEAST_QUERIES and size < self._samples.count:
+            size *= 2
+        return size
 
     @property
     def density(self) -> Any:
@@ -453,17 +468,19 @@ def _joined(parts: list[Any], uint: Any) -> Any:
     return total
 
 
-def _rank_in_ray(ray: Any, rays: int) -> Any:
-    """How many samples of the same ray come before each one; ``ray`` ascends."""
-    uint = type(ray)
+def _spans(ray: Any, rays: int) -> tuple[Any, Any]:
+    """Where the entries of each of the rays begin among ascending ray numbers, and how many."""
+    uint, last = type(ray), dr.opaque(type(ray), len(ray) - 1)
     place = dr.arange(uint, len(ray))
     before = dr.gather(uint, ray, place - 1, place > 0)
-    first = dr.zeros(uint, rays)
-    dr.make_opaque(first)
+    after = dr.gather(uint, ray, place + 1, place < last)
+    first, end = dr.zeros(uint, rays), dr.zeros(uint, rays)
+    dr.make_opaque(first, end)
     dr.scatter(first, place, ray, (place == 0) | (before != ray))
-    rank = place - dr.gather(uint, first, ray)
-    dr.eval(rank)
-    return rank
+    dr.scatter(end, place + 1, ray, (place == last) | (after != ray))
+    number = end - first
+    dr.eval(first, number)
+    return first, number
 
 
 def integrate(evaluation: Evaluation, samples: Samples) -> Composite:

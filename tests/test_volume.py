@@ -9,6 +9,7 @@ import drjit as dr
 import numpy as np
 import pytest
 
+from mi_nerf import volume
 from mi_nerf.encoding import FourierEncoding
 from mi_nerf.field import Corner, NeuralField, NeuralFieldConfig
 from mi_nerf.network import NetworkConfig
@@ -320,6 +321,13 @@ def test_settings_are_validated(change: dict[str, Any], named: str) -> None:
 # ---- Early termination ------------------------------------------------------
 
 
+@pytest.fixture
+def short_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rounds as of many rays."""
+    monkeypatch.setattr(volume, "_LEAST_QUERIES", 1)
+
+
+@pytest.mark.usefixtures("short_rounds")
 @pytest.mark.parametrize("stop", [1e-1, 1e-2, 1e-4])
 def test_early_termination_keeps_its_bound(ad: Any, stop: float) -> None:
     """Opacity loses less than ``stop``, colours less than that times the largest emission."""
@@ -335,6 +343,7 @@ def test_early_termination_keeps_its_bound(ad: Any, stop: float) -> None:
     assert short.queries < dense.queries
 
 
+@pytest.mark.usefixtures("short_rounds")
 def test_a_ray_ends_where_nothing_shows_any_more(ad: Any) -> None:
     """Opaque at once: the first round of samples is all that is asked for."""
     rays = make_rays(40)
@@ -345,14 +354,27 @@ def test_a_ray_ends_where_nothing_shows_any_more(ad: Any) -> None:
     assert render_rays(field, o, d, MarchSettings()).queries == 128 * hits
 
 
+def test_few_rays_are_asked_for_more_at_once(ad: Any) -> None:
+    """Rounds of few queries would take no less time than longer ones."""
+    rays = make_rays(40)
+    hits = int((np.diff(slow_interval(*rays, *BOX))[:, 0] > 0).sum())
+    o, d = (vectors(ad, v) for v in rays)
+    field = AnalyticField(uniform(1e4), None, *BOX)
+    assert render_rays(field, o, d, MarchSettings(stop=1e-4)).queries == 128 * hits
+
+
 def test_rays_that_see_nothing_have_no_rounds(ad: Any) -> None:
     o, d = vectors(ad, [(5, 5, 5)] * 3), vectors(ad, [(0, 0, 1)] * 3)
     seen = render_rays(AnalyticField(uniform(1.0)), o, d, MarchSettings(stop=1e-4))
     assert seen.queries == 0 and not image(seen).any()
 
 
-def test_rounds_change_nothing_of_what_is_seen(ad: Any) -> None:
+@pytest.mark.parametrize("least", [1, 1000, 1 << 14])
+def test_rounds_change_nothing_of_what_is_seen(
+    ad: Any, least: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With the least possible limit, every sample is asked for, in whatever order."""
+    monkeypatch.setattr(volume, "_LEAST_QUERIES", least)
     field, rays = NeuralField.create(SMALL, 0, ad.TensorXf), make_rays(60)
     dense = render(ad, field, rays)
     rounds = render(ad, field, rays, stop=1e-35)

@@ -24,6 +24,7 @@ def nerf() -> TrainConfig:
         network=NetworkConfig(depth=2, width=256, skip=-1, feature_layer=False, view_width=32),
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
+        occupancy=OccupancyConfig(resolution=96, queries=16384),
         sampling=SamplingConfig(batch=4096),
         optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, muon=True),
     )

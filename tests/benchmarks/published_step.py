@@ -21,7 +21,7 @@ import numpy as np
 from mi_nerf.backend import array_module, choose_variant
 from mi_nerf.cameras import Intrinsics, look_at
 from mi_nerf.data import Dataset
-from mi_nerf.report.arithmetic import drjit_product_rate, training_flop
+from mi_nerf.report.arithmetic import drjit_product_rate, numpy_product_rate, training_flop
 from mi_nerf.training.config import with_settings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.trainer import Trainer
@@ -63,7 +63,10 @@ def main() -> None:
         f"step: median {np.median(seconds):.2f} s, {min(seconds):.2f} to {max(seconds):.2f} s, "
         f"{rate:.0f} GFLOP/s, {resident_megabytes() / 1e3:.1f} GB resident"
     )
-    print(f"plain matrix product 256x256x16384: {drjit_product_rate(backend):.0f} GFLOP/s")
+    print(
+        f"plain matrix product 256x256x16384: {drjit_product_rate(backend):.0f} GFLOP/s in Dr.Jit, "
+        f"{numpy_product_rate():.0f} in NumPy on the CPU"
+    )
 
 
 if __name__ == "__main__":
