@@ -15,6 +15,7 @@ import pytest
 from hypothesis import settings
 
 import mi_nerf  # noqa: F401  (finds LLVM before Dr.Jit looks for it)
+from mi_nerf import volume
 from mi_nerf.cli import main
 from tests.datasets import write_blob_dataset
 
@@ -99,3 +100,9 @@ def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[...,
         return err.strip()
 
     return call
+
+
+@pytest.fixture
+def short_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Few rays end early in as short rounds as many rays do."""
+    monkeypatch.setattr(volume, "_LEAST_QUERIES", 1)

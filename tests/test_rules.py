@@ -318,6 +318,7 @@ def test_the_unit_of_length_does_not_matter(ad: Any, rule: str, scale: float) ->
     assert np.array(images[1]) == pytest.approx(np.array(images[0]), rel=2e-4, abs=2e-5)
 
 
+@pytest.mark.usefixtures("short_rounds")
 @every_rule
 def test_rays_that_end_early(ad: Any, rule: str) -> None:
     """They lose less than ``stop`` of the opacity, and ask less often."""

@@ -321,12 +321,6 @@ def test_settings_are_validated(change: dict[str, Any], named: str) -> None:
 # ---- Early termination ------------------------------------------------------
 
 
-@pytest.fixture
-def short_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Rounds as of many rays."""
-    monkeypatch.setattr(volume, "_LEAST_QUERIES", 1)
-
-
 @pytest.mark.usefixtures("short_rounds")
 @pytest.mark.parametrize("stop", [1e-1, 1e-2, 1e-4])
 def test_early_termination_keeps_its_bound(ad: Any, stop: float) -> None:
