@@ -152,7 +152,7 @@ class NeuralField:
 
     coarse: NeuralField | None = None  # says where this one is worth sampling (Sec. 5.2)
     noise: DensityNoise | None = None  # added to raw densities, in training
-    loss_scale: Any = None  # one value: emission is asked in half precision, in training
+    loss_scale: Any = None  # one value, in training: the network runs in half precision
 
     def __init__(
         self,
