@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, chaikin, grid_faces, output_folder, refine, write_ply
+from geometry import Array, chaikin, grid_faces, output_folder, refine, write_curves, write_ply
 from PIL import Image
 
 WIRES = 40
@@ -48,15 +48,9 @@ def dome_radius(height: Array) -> Array:
     )
 
 
-def write_curves(path: Path, curves: list[Array], radius: float = 0.0) -> None:
-    """Writes B-spline curves; points without a radius of their own get ``radius``."""
-    blocks = []
-    for curve in curves:
-        if curve.shape[1] == 3:
-            curve = np.column_stack([curve, np.full(len(curve), radius)])
-        rows = [" ".join(f"{x:.4f}".rstrip("0").rstrip(".") for x in row) for row in curve]
-        blocks.append("\n".join(rows))
-    path.write_text("\n\n".join(blocks) + "\n")
+def with_radius(curves: list[Array], radius: float) -> list[Array]:
+    """The same curves, of one radius."""
+    return [np.column_stack([curve, np.full(len(curve), radius)]) for curve in curves]
 
 
 def clamped(points: Array) -> Array:
@@ -288,16 +282,16 @@ def main() -> None:
     """Writes every file of the scene."""
     folder = output_folder()
     stream = np.random.default_rng(7)
-    write_curves(folder / "birdcage_wires.txt", wires(), 0.006)
-    write_curves(folder / "birdcage_rings.txt", rings(), 0.0095)
-    write_curves(folder / "birdcage_filigree.txt", filigree(), 0.0042)
-    write_curves(folder / "birdcage_door.txt", door(), 0.0065)
+    write_curves(folder / "birdcage_wires.txt", with_radius(wires(), 0.006))
+    write_curves(folder / "birdcage_rings.txt", with_radius(rings(), 0.0095))
+    write_curves(folder / "birdcage_filigree.txt", with_radius(filigree(), 0.0042))
+    write_curves(folder / "birdcage_door.txt", with_radius(door(), 0.0065))
     write_curves(folder / "birdcage_beads.txt", beads())
     write_curves(folder / "birdcage_seeds_light.txt", seeds(38, stream))
     write_curves(folder / "birdcage_seeds_dark.txt", seeds(22, stream))
     hook = around(np.linspace(-1.2, 4.3, 11), 0.05, 0)[:, [0, 2, 1]] + np.array([0, 0, 0.895])
     hook[0] = hook[0] * (0, 0, 1)
-    write_curves(folder / "birdcage_hook.txt", [clamped(hook)], 0.011)
+    write_curves(folder / "birdcage_hook.txt", with_radius([clamped(hook)], 0.011))
 
     skirt = [(0.55, -0.885), (0.73, -0.885), (0.745, -0.9), (0.77, -0.9), (0.782, -0.885)]
     skirt += [(0.77, -0.868), (0.735, -0.86), (0.70, -0.835), (0.698, -0.81), (0.715, -0.79)]
@@ -320,7 +314,7 @@ def main() -> None:
             toe = foot + [0.028, spread * 0.05, 0.004]
             legs.append(clamped([foot, toe, toe + [0.012, 0, -0.022]]))
         legs.append(clamped([foot, foot + [-0.022, 0, 0.0], foot + [-0.03, 0, -0.016]]))
-    write_curves(folder / "birdcage_legs.txt", legs, 0.0065)
+    write_curves(folder / "birdcage_legs.txt", with_radius(legs, 0.0065))
     beak = clamped([(0.15, 0, 0.106), (0.175, 0, 0.104), (0.195, 0, 0.098), (0.212, 0, 0.092)])
     taper = [0.02, 0.02, 0.02, 0.0175, 0.010, 0.002, 0.0015, 0.001]
     write_curves(folder / "birdcage_beak.txt", [np.column_stack([beak, taper])])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, output_folder, refine, write_ply
+from geometry import Array, output_folder, refine, write_curves, write_ply
 from PIL import Image
 
 WEDGES = 10
@@ -344,8 +344,7 @@ def main() -> None:
     lines, curves = foliage(stream)
     text = "\n".join(['<scene version="3.0.0">', *lines, "</scene>", ""])
     (folder / "bonsai_leaves.xml").write_text(text)
-    blocks = ["\n".join(" ".join(f"{x:.3f}" for x in row) for row in c) for c in curves]
-    (folder / "bonsai_branches.txt").write_text("\n\n".join(blocks) + "\n")
+    write_curves(folder / "bonsai_branches.txt", [np.asarray(c, float) for c in curves], 3)
     for i in range(SPRAYS):
         write_spray(folder / f"bonsai_spray_{i}.ply", 44, stream)
     write_pot(folder / "bonsai_pot.ply")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
+from geometry import Array, output_folder, write_curves, write_ply
 from PIL import Image
 
 CUTS = 14  # facets around the decanter
@@ -270,8 +270,7 @@ def main() -> None:
     write_wedge(folder / "decanter_lid.ply", lid, 0.10, 9)
     trim = [circle((0, 0, -0.747), 0.906, 0.012), circle((*BOX, -0.395), 0.05, 0.014)]
     trim.append(seam())
-    blocks = ["\n".join(" ".join(f"{x:.4f}" for x in row) for row in c) for c in trim]
-    (folder / "decanter_trim.txt").write_text("\n\n".join(blocks) + "\n")
+    write_curves(folder / "decanter_trim.txt", trim)
     studio(128).save(folder / "decanter_studio.png", optimize=True)
 
 

@@ -9,6 +9,7 @@ Every other script here makes the files of one scene. Run it again after a chang
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -91,3 +92,27 @@ def refine(points: Array, count: int) -> Array:
     p2, p3 = points[i + 1], points[np.minimum(i + 2, len(points) - 1)]
     curve = 2 * p1 + (p2 - p0) * f + (2 * p0 - 5 * p1 + 4 * p2 - p3) * f**2
     return (curve + (3 * p1 - p0 - 3 * p2 + p3) * f**3) / 2
+
+
+def write_curves(path: Path, curves: Sequence[Array], digits: int = 4) -> None:
+    """Writes B-spline curves, (N, 4) control points with radii each, for Mitsuba.
+
+    Mitsuba 3.9.1 reads beyond the last control point, and may crash, where a ray meets the
+    very end of the last curve of a file. So that none can, a tiny one hides in the last.
+    """
+
+    def rows(points: Array, digits: int) -> str:
+        texts = [[f"{x:.{digits}f}".rstrip("0").rstrip(".") for x in row] for row in points]
+        return "\n".join(" ".join(row) for row in texts)
+
+    blocks = [rows(curve, digits) for curve in curves] + [rows(_hidden_in(curves[-1]), 6)]
+    path.write_text("\n\n".join(blocks) + "\n")
+
+
+def _hidden_in(curve: Array) -> Array:
+    """Control points of a short thin curve on the middle of another."""
+    i = len(curve) // 2 - 1
+    middle = (curve[i - 1] + 4 * curve[i] + curve[i + 1]) / 6  # a knot of the B-spline
+    along = curve[i + 1, :3] - curve[i - 1, :3]
+    steps = 0.01 * middle[3] * np.arange(-1.5, 2)[:, None] * along / np.linalg.norm(along)
+    return np.column_stack([middle[:3] + steps, np.full(4, 0.05 * middle[3])])

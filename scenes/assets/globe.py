@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
+from geometry import Array, output_folder, write_curves, write_ply
 from PIL import Image, ImageDraw
 
 WIDTH, HEIGHT, FINE = 1280, 640, 2  # lines are drawn FINE times finer, then averaged
@@ -418,12 +418,8 @@ def write_cradle(path: Path, radius: float) -> None:
         flat = radius * np.cos(down)
         arc = np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), -radius * np.sin(down)], 1)
         thick = 0.013 + 0.009 * np.sin(np.clip(down, 0, np.pi / 2) * 2) ** 2
-        arcs.append(
-            "\n".join(
-                " ".join(f"{v:.4f}" for v in (*p, t)) for p, t in zip(arc, thick, strict=True)
-            )
-        )
-    path.write_text("\n\n".join(arcs) + "\n")
+        arcs.append(np.column_stack([arc, thick]))
+    write_curves(path, arcs)
 
 
 def write_ring_sector(path: Path, inner: float, outer: float, segments: int) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
-from solids import arc, box, curve, spline, wedge
+from geometry import Array, output_folder, write_curves, write_ply
+from solids import arc, box, spline, wedge
 
 PARTS = 4
 
@@ -39,7 +39,7 @@ def main() -> None:
         write_ply(path, solid.vertices, solid.faces, normals=solid.normals)
     angle = np.radians(np.arange(27) * 15.0)
     ring = np.stack([0.11 * np.cos(angle), 0 * angle, 0.11 * np.sin(angle), 0 * angle + 0.012], 1)
-    (folder / "hdr_ring.txt").write_text(curve(ring))
+    write_curves(folder / "hdr_ring.txt", [ring])
     board = box((0.03, 0.44, 0.4), 0.006)
     write_ply(folder / "hdr_plank.ply", board.vertices, board.faces, normals=board.normals)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, chaikin, grid_faces, output_folder, refine, write_ply
+from geometry import Array, chaikin, grid_faces, output_folder, refine, write_curves, write_ply
 from PIL import Image
 
 WEDGES = 10
@@ -173,8 +173,7 @@ def write_trivet(path: Path) -> None:
         radius = 0.25 + 0.36 * t
         bar = [radius * np.cos(angle), radius * np.sin(angle), 0 * t]
         curves.append(np.column_stack([*bar, np.full(9, 0.018)]))
-    blocks = ["\n".join(" ".join(f"{x:.4f}" for x in row) for row in c) for c in curves]
-    path.write_text("\n\n".join(blocks) + "\n")
+    write_curves(path, curves)
 
 
 def hammer_marks(size: int, marks: int) -> Image.Image:

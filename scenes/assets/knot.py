@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
-from solids import curve, wedge
+from geometry import Array, output_folder, write_curves, write_ply
+from solids import wedge
 
 STRANDS, TWISTS, POINTS = 6, 10, 130
 MAJOR, MINOR = 0.5, 0.205  # The torus that the trefoil winds around
@@ -43,7 +43,7 @@ def main() -> None:
     folder = output_folder()
     strands = [strand(number) for number in range(STRANDS)]
     for number, points in enumerate(strands):
-        (folder / f"knot_strand_{number}.txt").write_text(curve(points))
+        write_curves(folder / f"knot_strand_{number}.txt", [points])
     top = min(points[:, 2].min() for points in strands) - THICKNESS + 0.004
     solid, _ = wedge(plinth(top), 4, 16)
     path = folder / "knot_plinth.ply"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
+from geometry import Array, output_folder, write_curves, write_ply
 from PIL import Image
 
 
@@ -127,8 +127,7 @@ def main() -> None:
     for name, profile in (("reflector", reflector()), ("foot", foot()), ("tray", tray())):
         write_turned(folder / f"lamp_{name}.ply", profile)
     Image.fromarray((studio() * 255 + 0.5).astype(np.uint8)).save(folder / "lamp_studio.png")
-    rows = (" ".join(f"{value:.4f}" for value in row) for row in arm())
-    (folder / "lamp_arm.txt").write_text("\n".join(rows) + "\n")
+    write_curves(folder / "lamp_arm.txt", [arm()])
 
 
 if __name__ == "__main__":

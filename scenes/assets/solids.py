@@ -174,11 +174,6 @@ def spline(points: Sequence[Sequence[float]], steps: int) -> Array:
     return np.vstack([*out, p[-2:-1]])
 
 
-def curve(points: Array) -> str:
-    """The text of a curve for Mitsuba, from places and radii."""
-    return "".join(" ".join(f"{value:.4f}" for value in row) + "\n" for row in points)
-
-
 def step(kind: str, **values: float) -> str:
     """One step of a transform: translate, rotate or scale."""
     listed = " ".join(f'{name}="{value:.5g}"' for name, value in values.items())

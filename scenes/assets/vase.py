@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
+from geometry import Array, output_folder, write_curves, write_ply
 from PIL import Image
-from solids import arc, curve, spline, wedge
+from solids import arc, spline, wedge
 
 PARTS = 8  # The painting repeats this often around the vase
 WIDTH, HEIGHT = 160, 896
@@ -157,8 +157,8 @@ def main() -> None:
     picture = Image.fromarray(painting(length), "P")
     picture.putpalette([value for colour in COLOURS for value in colour])
     picture.save(folder / "vase_painting.png", optimize=True)
-    (folder / "vase_handle.txt").write_text(curve(handle()))
-    (folder / "vase_lemon.txt").write_text(curve(lemon()))
+    write_curves(folder / "vase_handle.txt", [handle()])
+    write_curves(folder / "vase_lemon.txt", [lemon()])
 
 
 if __name__ == "__main__":
