@@ -100,13 +100,14 @@ def write_curves(path: Path, curves: Sequence[Array], digits: int = 4) -> None:
     Mitsuba 3.9.1 reads beyond the last control point, and may crash, where a ray meets the
     very end of the last curve of a file. So that none can, a tiny one hides in the last.
     """
-
-    def rows(points: Array, digits: int) -> str:
-        texts = [[f"{x:.{digits}f}".rstrip("0").rstrip(".") for x in row] for row in points]
-        return "\n".join(" ".join(row) for row in texts)
-
-    blocks = [rows(curve, digits) for curve in curves] + [rows(_hidden_in(curves[-1]), 6)]
+    blocks = [_rows(curve, digits) for curve in curves]
+    blocks.append(_rows(_hidden_in(curves[-1]), 6))
     path.write_text("\n\n".join(blocks) + "\n")
+
+
+def _rows(points: Array, digits: int) -> str:
+    numbers = [[f"{x:.{digits}f}".rstrip("0").rstrip(".") for x in row] for row in points]
+    return "\n".join(" ".join(row) for row in numbers)
 
 
 def _hidden_in(curve: Array) -> Array:
