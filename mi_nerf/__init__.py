@@ -22,21 +22,22 @@ from ._llvm import ensure_llvm
 
 ensure_llvm()  # before Dr.Jit looks for its compiler
 
-from .errors import InputError  # noqa: E402
-from .field import Field, NeuralField, NeuralFieldConfig  # noqa: E402
-from .field_file import FieldFile, load_field, save_field  # noqa: E402
+from .base.errors import InputError  # noqa: E402
+from .fields.neural import NeuralField, NeuralFieldConfig  # noqa: E402
+from .fields.protocol import Field  # noqa: E402
+from .formats.field_file import FieldFile, load_field, save_field  # noqa: E402
 from .plugins import register_always  # noqa: E402
 
 if TYPE_CHECKING:
-    from .backend import available_variants, choose_variant
+    from .api import describe, evaluate, generate, pictures, render, start
+    from .base.variants import available_variants, choose_variant
     from .data import Dataset, load_dataset
-    from .images import on_white, write_picture
-    from .metrics import psnr, ssim
-    from .scene_library import find_scene, scenes
-    from .target import Target, open_target
+    from .images.metrics import psnr, ssim
+    from .images.write import on_white, write_picture
+    from .scene_xml.library import find_scene, scenes
+    from .tasks.target import Target, open_target
     from .training.config import TrainConfig, setting_names
     from .training.run import Run, TrainingError
-    from .workflow import describe, evaluate, generate, pictures, render, start
 
 register_always()
 
@@ -44,28 +45,28 @@ __version__ = "0.1.0"
 
 # Imported when first asked for: XML scenes need none of it.
 _LATER = {
-    "available_variants": "backend",
-    "choose_variant": "backend",
+    "available_variants": "base.variants",
+    "choose_variant": "base.variants",
     "Dataset": "data",
     "load_dataset": "data",
-    "on_white": "images",
-    "write_picture": "images",
-    "psnr": "metrics",
-    "ssim": "metrics",
-    "find_scene": "scene_library",
-    "scenes": "scene_library",
-    "Target": "target",
-    "open_target": "target",
+    "on_white": "images.write",
+    "write_picture": "images.write",
+    "psnr": "images.metrics",
+    "ssim": "images.metrics",
+    "find_scene": "scene_xml.library",
+    "scenes": "scene_xml.library",
+    "Target": "tasks.target",
+    "open_target": "tasks.target",
     "TrainConfig": "training.config",
     "setting_names": "training.config",
     "Run": "training.run",
     "TrainingError": "training.run",
-    "describe": "workflow",
-    "evaluate": "workflow",
-    "generate": "workflow",
-    "render": "workflow",
-    "start": "workflow",
-    "pictures": "workflow",
+    "describe": "api",
+    "evaluate": "api",
+    "generate": "api",
+    "render": "api",
+    "start": "api",
+    "pictures": "api",
 }
 
 __all__ = [

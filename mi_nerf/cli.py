@@ -13,10 +13,10 @@ from typing import Any
 
 import tyro
 
+from .base.errors import InputError
 from .commands import COMMANDS, command_type
-from .errors import InputError
+from .commands.usage import unknown_command, usage_error
 from .training.run import TrainingError
-from .usage import unknown_command, usage_error
 
 _LISTS = ("--set", "--vary")  # options that may be followed by several values
 

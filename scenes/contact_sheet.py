@@ -17,9 +17,9 @@ import numpy as np
 from tqdm import tqdm
 
 import mi_nerf  # noqa: F401  (finds LLVM before Mitsuba looks for it)
-from mi_nerf.backend import choose_variant
-from mi_nerf.images import on_white
-from mi_nerf.scene_file import SceneFile
+from mi_nerf.base.variants import choose_variant
+from mi_nerf.images.write import on_white
+from mi_nerf.scene_xml.scene_file import SceneFile
 
 GROUPS = ("realistic", "diffuse", "forward", "hard")
 COLUMNS, TILE, SUPERSAMPLING, SPP = 6, 200, 2, 128

@@ -15,9 +15,9 @@ import pytest
 from hypothesis import settings
 
 import mi_nerf  # noqa: F401  (finds LLVM before Dr.Jit looks for it)
-from mi_nerf import volume
 from mi_nerf.cli import main
-from tests.datasets import write_blob_dataset
+from mi_nerf.march import query
+from tests.support.datasets import write_blob_dataset
 
 # The first example of a property may have to wait for the compiler.
 settings.register_profile("local", deadline=None)
@@ -105,4 +105,4 @@ def refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[...,
 @pytest.fixture
 def short_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
     """Few rays end early in as short rounds as many rays do."""
-    monkeypatch.setattr(volume, "_LEAST_QUERIES", 1)
+    monkeypatch.setattr(query, "_LEAST_QUERIES", 1)

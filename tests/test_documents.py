@@ -19,14 +19,15 @@ import numpy as np
 import pytest
 
 import mi_nerf
-from mi_nerf import cli, closed_form
+from mi_nerf import cli
+from mi_nerf.base.errors import InputError
 from mi_nerf.cli import main
 from mi_nerf.commands import COMMANDS
-from mi_nerf.errors import InputError
+from mi_nerf.fields import closed_form
 from mi_nerf.training.config import setting_names, with_settings
 from mi_nerf.training.presets import PRESETS, preset
-from tests import settings_page
-from tests.fields import small_file
+from tests.support import settings_page
+from tests.support.fields import small_file
 
 ROOT = Path(__file__).parent.parent
 README = ROOT / "README.md"
@@ -313,7 +314,7 @@ def test_xml_in_the_text_is_well_formed() -> None:
 def test_the_settings_page_is_complete_and_current() -> None:
     text = settings_page.PAGE.read_text()
     written = text.partition(settings_page.MARK)[2]
-    assert written == settings_page.tables(), "run python -m tests.settings_page"
+    assert written == settings_page.tables(), "run python -m tests.support.settings_page"
     for name in setting_names():
         row = rf"^\| `{re.escape(name)}` \| [^|]+ \| `[^|]+` \| ([^|]+) \|$"
         assert len(re.findall(row, written, re.MULTILINE)) == 1, name

@@ -15,21 +15,25 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from mi_nerf import hull, load_field
-from mi_nerf.backend import array_module, choose_variant
-from mi_nerf.cameras import Intrinsics, average_pose, look_at, sensor_dict
+from mi_nerf import load_field
+from mi_nerf.base.variants import array_module, choose_variant
+from mi_nerf.cameras.ndc import Ndc
+from mi_nerf.cameras.pinhole import Intrinsics, sensor_dict
+from mi_nerf.cameras.poses import average_pose, look_at
+from mi_nerf.cameras.trajectory import forward_spiral
 from mi_nerf.cli import main
-from mi_nerf.data import load_dataset
-from mi_nerf.ndc import Ndc
+from mi_nerf.data import hull, load_dataset
+from mi_nerf.march.placing import place_samples
+from mi_nerf.march.query import Evaluation
+from mi_nerf.march.render import integrate, render_rays
+from mi_nerf.march.settings import MarchSettings
+from mi_nerf.march.view import render_view
 from mi_nerf.training.config import TrainConfig
 from mi_nerf.training.trainer import field_config
-from mi_nerf.trajectory import forward_spiral
-from mi_nerf.views import render_view
-from mi_nerf.volume import Evaluation, MarchSettings, integrate, place_samples, render_rays
-from tests.analytic import AnalyticField, uniform
-from tests.arrays import unit, vectors
-from tests.datasets import forward_poses, orbit_poses, write_llff_dataset
-from tests.fields import scene_dict, small_file
+from tests.support.analytic import AnalyticField, uniform
+from tests.support.arrays import unit, vectors
+from tests.support.datasets import forward_poses, orbit_poses, write_llff_dataset
+from tests.support.fields import scene_dict, small_file
 
 NDC = Ndc(1.4, 1.8)
 

@@ -8,8 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..ablation import ROWS, ablate, table
-from ..backend import choose_variant
+from ..base.variants import choose_variant
+from ..tasks.ablate import ROWS, ablate, table
 from ..training.config import with_settings
 from ..training.presets import preset
 from .shared import Variant, positive

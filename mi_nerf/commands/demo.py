@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..backend import choose_variant
-from ..demo import run_demo
+from ..base.variants import choose_variant
+from ..tasks.demo import run_demo
 from .shared import Variant, positive, valid_seed
 
 

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from ..backend import choose_variant
-from ..evaluation import quality
-from ..files import check_file, check_folder, make_folder, write_json
-from ..workflow import evaluate
+from ..api import evaluate
+from ..base.files import check_file, check_folder, make_folder, write_json
+from ..base.variants import choose_variant
+from ..tasks.evaluate import quality
 from .shared import Variant, progress_bar
 
 

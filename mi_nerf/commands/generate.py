@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..backend import choose_variant
+from ..api import generate
+from ..base.variants import choose_variant
 from ..generation import Options
 from ..generation.run import summary
-from ..workflow import generate
 from .shared import Variant, name_and_value
 
 

@@ -9,12 +9,12 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..backend import choose_variant
-from ..encoding import Convention
-from ..errors import InputError
-from ..field_file import save_field
-from ..files import check_file, make_folder
-from ..importing import ImportSettings, import_network, occupied_cells
+from ..base.errors import InputError
+from ..base.files import check_file, make_folder
+from ..base.variants import choose_variant
+from ..fields.fourier import Convention
+from ..formats.field_file import save_field
+from ..formats.foreign_networks import ImportSettings, import_network, occupied_cells
 from .shared import Variant, positive
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ..workflow import describe
+from ..api import describe
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..backend import choose_variant
-from ..errors import InputError
-from ..rendering import check_output, frames_of, output_kind, write_frames
-from ..scene_library import scenes
+from ..base.errors import InputError
+from ..base.variants import choose_variant
+from ..scene_xml.library import scenes
+from ..tasks.render import check_output, frames_of, output_kind, write_frames
 from .shared import Variant, positive, progress_bar
 
 

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 from tqdm.auto import tqdm
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..backend import choose_variant
-from ..errors import InputError
-from ..quadrature import Rule
+from ..base.errors import InputError
+from ..base.variants import choose_variant
+from ..march.quadrature import Rule
 from ..report import Knobs, report, report_training, rows_of
 from ..report.curves_text import conclusions
 from ..report.profile import summary

@@ -6,9 +6,9 @@ from typing import Annotated
 
 from tyro.conf import arg
 
-from ..bars import progress_bar
-from ..checks import positive, valid_seed
-from ..errors import InputError
+from ..base.checks import positive, valid_seed
+from ..base.errors import InputError
+from ..base.progress_bar import progress_bar
 
 __all__ = ["Variant", "name_and_value", "positive", "progress_bar", "valid_seed"]
 

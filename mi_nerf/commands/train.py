@@ -8,8 +8,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..backend import choose_variant
-from ..workflow import start
+from ..api import start
+from ..base.variants import choose_variant
 from .shared import Variant
 
 

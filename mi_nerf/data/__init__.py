@@ -9,10 +9,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from ..errors import InputError
+from ..base.box import Box
+from ..base.color import ColorSpace
+from ..base.errors import InputError
+from ..images.read import Progress
 from . import blender, llff
-from .dataset import Box, ColorSpace, Dataset, evenly_spread_indices
-from .images import Progress
+from .dataset import Dataset, evenly_spread_indices
 
 __all__ = [
     "Box",

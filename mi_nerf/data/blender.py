@@ -32,10 +32,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Intrinsics, is_rigid, opengl_from_mitsuba
-from ..errors import InputError
-from .dataset import Box, Dataset, evenly_spread_indices
-from .images import IMAGE_SUFFIXES, Progress, read_images
+from ..base.box import Box
+from ..base.errors import InputError
+from ..cameras.pinhole import Intrinsics
+from ..cameras.poses import is_rigid, opengl_from_mitsuba
+from ..images.read import IMAGE_SUFFIXES, Progress, read_images
+from .dataset import Dataset, evenly_spread_indices
 
 _USUAL_SPLITS = ("train", "val", "test")
 _INTRINSIC_KEYS = ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h")

@@ -5,17 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..cameras import Intrinsics
-from ..errors import InputError
-from ..ndc import Ndc
-
-ColorSpace = Literal["srgb", "linear"]
-Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+from ..base.box import Box
+from ..base.color import ColorSpace
+from ..base.errors import InputError
+from ..cameras.ndc import Ndc
+from ..cameras.pinhole import Intrinsics
 
 
 # Compared by identity: equality of arrays has no single truth value.

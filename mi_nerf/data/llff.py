@@ -23,11 +23,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cameras import Intrinsics, average_pose, is_rigid
-from ..errors import InputError
-from ..ndc import Ndc
-from .dataset import Box, Dataset, evenly_spread_indices
-from .images import IMAGE_SUFFIXES, Progress, read_images
+from ..base.box import Box
+from ..base.errors import InputError
+from ..cameras.ndc import Ndc
+from ..cameras.pinhole import Intrinsics
+from ..cameras.poses import average_pose, is_rigid
+from ..images.read import IMAGE_SUFFIXES, Progress, read_images
+from .dataset import Dataset, evenly_spread_indices
 
 POSES = "poses_bounds.npy"
 SPLITS = ("train", "test")

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..cameras import Intrinsics
-from ..files import make_folder, replacing
+from ..base.files import make_folder, replacing
+from ..cameras.pinhole import Intrinsics
 
 Array = np.ndarray[Any, Any]
 

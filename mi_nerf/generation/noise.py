@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..images import on_white
+from ..images.write import on_white
 
 Image = np.ndarray[Any, Any]
 

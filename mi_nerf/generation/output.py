@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..cameras import Intrinsics
-from ..files import write_json
-from ..images import write_exr, write_picture
+from ..base.files import write_json
+from ..cameras.pinhole import Intrinsics
+from ..images.write import write_exr, write_picture
 from .llff import poses_bounds, write_llff
 from .noise import estimate, mean_image
 from .plan import Plan, View

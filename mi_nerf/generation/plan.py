@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..cameras import Intrinsics, look_at, opengl_from_mitsuba
-from ..errors import InputError
-from ..scene_file import Bounds, SceneFile
+from ..base.errors import InputError
+from ..cameras.pinhole import Intrinsics
+from ..cameras.poses import look_at, opengl_from_mitsuba
+from ..scene_xml.scene_file import Bounds, SceneFile
 from . import viewpoints
 from .protocol import CAMERA_ANGLE_X, HOLD_OUT, PROTOCOLS, RADIUS, SPLITS, Cameras, Options
 from .surfaces import depth_bounds, trace_surfaces

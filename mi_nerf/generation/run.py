@@ -13,18 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
-from ..bars import bars_are_seen, progress_bar
-from ..errors import InputError
-from ..files import check_folder, make_folder, read_json, write_json
-from ..interrupts import interruptible
-from ..scene_file import SceneFile, visible_bounds
-from .output import (
-    is_intact,
-    write_forward_capture,
-    write_transforms,
-    write_view,
-)
+from .._version import __version__
+from ..base.errors import InputError
+from ..base.files import check_folder, make_folder, read_json, write_json
+from ..base.interrupts import interruptible
+from ..base.progress_bar import bars_are_seen, progress_bar
+from ..scene_xml.scene_file import SceneFile, visible_bounds
+from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View, make_plan, protocol_name
 from .protocol import SPLITS, Options
 from .tracer import Tracer

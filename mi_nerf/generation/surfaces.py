@@ -7,8 +7,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..arrays import upload
-from ..cameras import Intrinsics, pack_poses, pixel_rays
+from ..base.arrays import upload
+from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 
 Image = np.ndarray[Any, Any]
 

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..cameras import mitsuba_from_opengl, sensor_dict
-from ..errors import InputError
+from ..base.errors import InputError
+from ..cameras.pinhole import sensor_dict
+from ..cameras.poses import mitsuba_from_opengl
 from .plan import Plan, View
 from .surfaces import trace_surfaces
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..cameras import look_at
+from ..cameras.poses import look_at
 
 Array = np.ndarray[Any, Any]
 

@@ -15,14 +15,15 @@ import mitsuba as mi
 
 # Each before those that import it.
 _MODULES = (
-    "medium",
+    "nerfmedium",
     "backdrop",
     "paths",
-    "camera",
+    "film",
+    "stage",
     "marching",
-    "integrator",
-    "path_integrator",
-    "tracking",
+    "nerf",
+    "nerf_path",
+    "nerf_tracking",
 )
 _loaded_for: str | None = None
 _follows_variant = False

@@ -13,8 +13,8 @@ import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import ADIntegrator, RBIntegrator
 
-from ..color import linear_to_srgb
-from ..errors import InputError
+from ..base.color import linear_to_srgb
+from ..base.errors import InputError
 from .placement import is_field
 
 

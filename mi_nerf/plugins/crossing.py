@@ -12,19 +12,16 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import gather_vector3
-from ..color import srgb_to_linear
-from ..errors import InputError
-from ..merging import Layer, integrate_merged, merge
-from ..normals import density_gradient
-from ..volume import (
-    Evaluation,
-    MarchSettings,
-    RaySegments,
-    integrate,
-    place_samples,
-    ray_segments,
-)
+from ..base.arrays import gather_vector3
+from ..base.color import srgb_to_linear
+from ..base.errors import InputError
+from ..march.intervals import RaySegments, ray_segments
+from ..march.merging import Layer, integrate_merged, merge
+from ..march.normals import density_gradient
+from ..march.placing import place_samples
+from ..march.query import Evaluation
+from ..march.render import integrate
+from ..march.settings import MarchSettings
 from .placement import PlacedField
 
 
@@ -112,7 +109,7 @@ class View:
     """What R rays see of all fields together, before what lies behind them.
 
     In a differentiable mode, derivatives pass through the fields' answers and their places,
-    block by block, as in :class:`mi_nerf.volume.Evaluation`.
+    block by block, as in :class:`mi_nerf.march.query`.
     """
 
     values: list[Any]  # R, G, B (linear, premultiplied), opacity, depth in world units

@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import upload
-from ..field import Corner
-from ..sampling import box_interval
+from ..base.arrays import upload
+from ..base.box import Corner
+from ..march.intervals import box_interval
 from .crossing import Marched
 from .placement import Matrix, PlacedField
 

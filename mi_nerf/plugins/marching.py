@@ -9,11 +9,11 @@ from typing import Any, get_args
 
 import mitsuba as mi
 
-from ..errors import InputError
-from ..quadrature import Rule
-from ..volume import MarchSettings
-from .camera import FieldIntegrator
+from ..base.errors import InputError
+from ..march.quadrature import Rule
+from ..march.settings import MarchSettings
 from .crossing import Marched
+from .film import FieldIntegrator
 from .placement import PlacedField
 from .stage import Stage, StageWave
 

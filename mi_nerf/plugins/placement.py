@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..arrays import upload
-from ..errors import InputError
+from ..base.arrays import upload
+from ..base.errors import InputError
 
 Matrix = np.ndarray[Any, Any]
 

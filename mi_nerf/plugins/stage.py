@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 
 from .backdrop import Backdrop, Behind
-from .camera import Wave
 from .crossing import Marched, Rays, View, chunks
+from .film import Wave
 from .segments import see
 
 

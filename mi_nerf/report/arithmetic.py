@@ -9,8 +9,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..field import NeuralFieldConfig
-from ..network import GRID
+from ..fields.network import GRID
+from ..fields.neural import NeuralFieldConfig
 
 _SHAPE = (256, 256, 16384)  # of the product that sets the limit: a wide layer, a full block
 _REPETITIONS = 20

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from ..base.errors import InputError
+from ..base.files import make_folder, read_json, replacing, write_json
+from ..base.machine import machine
 from ..data import held_out_split, load_dataset
-from ..errors import InputError
-from ..evaluation import evaluate
-from ..files import make_folder, read_json, replacing, write_json
-from ..machine import machine
-from ..target import Target
+from ..tasks.evaluate import evaluate
+from ..tasks.series import check_same, mean, trained
+from ..tasks.target import Target
 from ..training.config import TrainConfig, setting_names, to_json, with_settings
 from ..training.presets import preset
 from ..training.run import Run
 from ..training.run_folder import CONFIG
-from ..trainings import check_same, mean, trained
 
 Record = dict[str, Any]
 

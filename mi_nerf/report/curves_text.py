@@ -6,7 +6,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from ..machine import machine_line
+from ..base.machine import machine_line
 
 Record = dict[str, Any]
 

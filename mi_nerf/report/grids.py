@@ -8,8 +8,9 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..field import Field
-from ..occupancy import OccupancyGrid, grid_shape
+from ..base.box import grid_shape
+from ..fields.protocol import Field
+from ..march.occupancy import OccupancyGrid
 
 Cells = NDArray[np.bool_]
 

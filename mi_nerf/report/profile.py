@@ -11,12 +11,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..backend import array_module
+from ..base.errors import InputError
+from ..base.files import replacing
+from ..base.kernel_stages import Launch, recording
+from ..base.variants import array_module
 from ..data import load_dataset
-from ..errors import InputError
-from ..files import replacing
-from ..stages import Launch, recording
-from ..target import Target
+from ..tasks.target import Target
 from ..training.checkpoint import load_checkpoint
 from ..training.run_folder import CHECKPOINT, read_config
 from ..training.trainer import Trainer
@@ -24,7 +24,7 @@ from .arithmetic import drjit_product_rate, numpy_product_rate, training_flop
 
 FIGURE = "step_time.png"
 
-# What a report calls the stages of mi_nerf.stages, and the parts of a step besides them.
+# What a report calls the stages of base/kernel_stages.py, and the parts of a step besides them.
 LABELS = {
     "rays": "rays and pixels drawn, random numbers",
     "samples": "samples placed, empty ones left out, cut into blocks",

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from ..base.errors import InputError
+from ..base.files import check_folder, make_folder, read_json, replacing, write_json
+from ..base.machine import machine
 from ..data import load_dataset
-from ..errors import InputError
-from ..files import check_folder, make_folder, read_json, replacing, write_json
-from ..machine import machine
-from ..target import Target, open_target
+from ..tasks.target import Target, open_target
 from ..training.config import TrainConfig
 from . import curves_text, speed_text
 from . import profile as step_profile

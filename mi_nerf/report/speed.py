@@ -1,11 +1,11 @@
 """Speed against error: one field, rendered with many settings, against its reference.
 
 One knob is turned at a time, away from the field's own settings. All settings see the same
-rays, through :func:`mi_nerf.volume.render_rays` as evaluation and Mitsuba renderings do. Three
+rays, through :func:`mi_nerf.march.render.render_rays` as evaluation and Mitsuba do. Three
 errors are told apart:
 
-- *quadrature*: of a rendering against :func:`mi_nerf.reference.reference`, the same field
-  marched in double precision behind its own occupancy grid until the error is known;
+- *quadrature*: of a rendering against :func:`mi_nerf.estimators.reference.reference`, the same
+  field marched in double precision behind its own occupancy grid until the error is known;
 - *model*: of the reference against the images, what would remain with perfect quadrature;
 - *both*: of a rendering against the images.
 """
@@ -20,11 +20,12 @@ from typing import Any, get_args
 import drjit as dr
 import numpy as np
 
-from ..machine import machine
-from ..occupancy import OccupancyGrid
-from ..quadrature import Rule
-from ..reference import Reference, reference
-from ..volume import MarchSettings, render_rays
+from ..base.machine import machine
+from ..estimators.reference import Reference, reference
+from ..march.occupancy import OccupancyGrid
+from ..march.quadrature import Rule
+from ..march.render import render_rays
+from ..march.settings import MarchSettings
 from .grids import Grids, own_resolution
 from .pareto import pareto_front
 from .subject import Subject

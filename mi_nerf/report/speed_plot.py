@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ..machine import machine_line
+from ..base.machine import machine_line
 from .speed_text import WORDS
 
 Record = dict[str, Any]

@@ -6,8 +6,8 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from ..errors import InputError
-from ..machine import machine_line
+from ..base.errors import InputError
+from ..base.machine import machine_line
 
 Record = dict[str, Any]
 Point = dict[str, Any]

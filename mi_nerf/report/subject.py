@@ -12,20 +12,20 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..arrays import upload, vector3_type
-from ..backend import array_module
-from ..cameras import Intrinsics, pack_poses, pixel_rays
-from ..closed_form import CLOSED_FORMS, ClosedFormField, closed_form
-from ..color import linear_to_srgb
+from ..base.arrays import upload, vector3_type
+from ..base.color import linear_to_srgb
+from ..base.errors import InputError
+from ..base.variants import array_module
+from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
+from ..cameras.trajectory import orbit
 from ..data import held_out_split
-from ..errors import InputError
-from ..evaluation import held_out, reference_image
-from ..field import Field
-from ..metrics import to_8bit
-from ..occupancy import OccupancyGrid
-from ..target import Target, open_target
-from ..trajectory import orbit
-from ..volume import MarchSettings
+from ..fields.closed_form import CLOSED_FORMS, ClosedFormField, closed_form
+from ..fields.protocol import Field
+from ..images.metrics import to_8bit
+from ..march.occupancy import OccupancyGrid
+from ..march.settings import MarchSettings
+from ..tasks.evaluate import held_out, reference_image
+from ..tasks.target import Target, open_target
 
 Array = np.ndarray[Any, Any]
 
@@ -41,7 +41,7 @@ class Subject:
     """A field, and R rays through pixel centres of some views, in random order."""
 
     name: str
-    formula: bool  # the field is one of mi_nerf.closed_form
+    formula: bool  # the field is one of mi_nerf.fields.closed_form
     field: Field
     occupancy: OccupancyGrid | None  # the field's own grid
     march: MarchSettings  # the field's own settings
@@ -119,7 +119,7 @@ def open_subject(
 
     Args:
         target: a run folder, a field file, or the name of a formula such as ``"shell"``
-            (:mod:`mi_nerf.closed_form`), unless a file is called so.
+            (:mod:`mi_nerf.fields.closed_form`), unless a file is called so.
         values: parameters of the formula, the others by default.
         data, split, downscale: the images; by default those of a run at its own scale, of the
             split ``test`` or whatever there is beside ``train``. A field file without ``data``

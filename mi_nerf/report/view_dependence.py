@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from ..backend import array_module
-from ..cameras import Intrinsics, pack_poses, pixel_rays
-from ..color import linear_to_srgb
-from ..errors import InputError
-from ..field import Field
-from ..files import replacing
-from ..occupancy import OccupancyGrid
-from ..volume import MarchSettings, render_rays
+from ..base.color import linear_to_srgb
+from ..base.errors import InputError
+from ..base.files import replacing
+from ..base.variants import array_module
+from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
+from ..fields.protocol import Field
+from ..march.occupancy import OccupancyGrid
+from ..march.render import render_rays
+from ..march.settings import MarchSettings
 
 Array = np.ndarray[Any, Any]
 

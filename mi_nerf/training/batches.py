@@ -8,10 +8,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..arrays import gather_vector3
-from ..cameras import pack_poses, pixel_rays
+from ..base.arrays import gather_vector3
+from ..base.kernel_stages import stage
+from ..cameras.pinhole import pack_poses, pixel_rays
 from ..data import Dataset
-from ..stages import stage
 
 
 @dataclass

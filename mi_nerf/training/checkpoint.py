@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import upload
-from ..errors import InputError
-from ..tensor_file import prefixed, read_tensors, write_tensors
+from ..base.arrays import upload
+from ..base.errors import InputError
+from ..base.tensor_file import prefixed, read_tensors, write_tensors
 from .trainer import Trainer
 
 VERSION = 2  # 2: the occupancy grid's floor

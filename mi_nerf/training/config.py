@@ -8,13 +8,13 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from ..activations import ColorActivation, DensityActivation
-from ..encoding import FourierEncoding
-from ..errors import InputError
-from ..fused_network import WIDEST
-from ..hash_grid import HashGridConfig
-from ..network import NetworkConfig
-from ..quadrature import Rule
+from ..base.errors import InputError
+from ..fields.activations import ColorActivation, DensityActivation
+from ..fields.fourier import FourierEncoding
+from ..fields.fused_network import WIDEST
+from ..fields.hash_grid import HashGridConfig
+from ..fields.network import NetworkConfig
+from ..march.quadrature import Rule
 from .plain import assign, build, leaf_names, require
 
 

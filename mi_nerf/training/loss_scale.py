@@ -7,7 +7,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..arrays import upload
+from ..base.arrays import upload
 
 _START = 2.0**13
 _LARGEST = 2.0**24

@@ -15,8 +15,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..arrays import upload
-from ..network import GRID
+from ..base.arrays import upload
+from ..fields.network import GRID
 from .orthogonal import is_hidden, orthogonalized, update_size
 
 

@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from ..encoding import FourierEncoding
-from ..errors import InputError
-from ..hash_grid import HashGridConfig
-from ..network import NetworkConfig
-from .config import (
-    DensityConfig,
-    OccupancyConfig,
-    OptimizerConfig,
-    SamplingConfig,
-    TrainConfig,
-)
+from ..base.errors import InputError
+from ..fields.fourier import FourierEncoding
+from ..fields.hash_grid import HashGridConfig
+from ..fields.network import NetworkConfig
+from .config import DensityConfig, OccupancyConfig, OptimizerConfig, SamplingConfig, TrainConfig
 
 
 def nerf() -> TrainConfig:

@@ -12,10 +12,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..arrays import vector3_type
-from ..bars import progress_bar
+from ..base.arrays import vector3_type
+from ..base.progress_bar import progress_bar
 from ..data import Dataset
-from ..field import NeuralField
+from ..fields.neural import NeuralField
 from .batches import RaySource, step_rng
 from .config import TrainConfig
 from .schedule import learning_rate

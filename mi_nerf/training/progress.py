@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..bars import bars_are_seen, progress_bar
+from ..base.progress_bar import bars_are_seen, progress_bar
 from .config import TrainConfig
 from .trainer import StepResult
 

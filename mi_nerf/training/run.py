@@ -16,16 +16,16 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .. import __version__
-from ..backend import array_module
-from ..cameras import Intrinsics
+from .._version import __version__
+from ..base.errors import InputError
+from ..base.files import check_folder, make_folder, write_json
+from ..base.interrupts import interruptible
+from ..base.variants import array_module
+from ..cameras.pinhole import Intrinsics
 from ..data import Dataset, load_dataset
-from ..errors import InputError
-from ..field_file import FieldFile, save_field
-from ..files import check_folder, make_folder, write_json
-from ..interrupts import interruptible
-from ..views import Image, View, display_image, render_view
-from ..volume import MarchSettings
+from ..formats.field_file import FieldFile, save_field
+from ..march.settings import MarchSettings
+from ..march.view import Image, View, display_image, render_view
 from .auto import Choice, Decision, choose
 from .checkpoint import load_checkpoint, save_checkpoint
 from .config import TrainConfig, to_json
@@ -167,7 +167,7 @@ class Run:
         self.pause()
 
     def view(self, intrinsics: Intrinsics, cam_to_world: ArrayLike, spp: int = 1) -> View:
-        """What a camera sees of the field as it is now; see :func:`mi_nerf.views.render_view`.
+        """What a camera sees of the field as it is now; see :func:`mi_nerf.march.view.render_view`.
 
         Args:
             cam_to_world: (4, 4), OpenGL axes.

@@ -6,8 +6,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..files import read_json
+from ..base.errors import InputError
+from ..base.files import read_json
 from .config import TrainConfig, from_json
 
 CONFIG, CHECKPOINT, FIELD, LOG = (

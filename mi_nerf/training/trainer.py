@@ -12,23 +12,21 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from .. import hull
-from ..data import Dataset
-from ..encoding import FourierEncoding
-from ..errors import InputError
-from ..field import Corner, DensityNoise, Field, NeuralField, NeuralFieldConfig
-from ..occupancy import OccupancyGrid, grid_shape
-from ..quadrature import Composite, over_background
-from ..stages import stage
-from ..volume import (
-    Evaluation,
-    MarchSettings,
-    Samples,
-    integrate,
-    place_samples,
-    refine,
-    render_rays,
-)
+from ..base.box import Corner, grid_shape
+from ..base.errors import InputError
+from ..base.kernel_stages import stage
+from ..data import Dataset, hull
+from ..fields.fourier import FourierEncoding
+from ..fields.neural import NeuralField, NeuralFieldConfig
+from ..fields.noise import DensityNoise
+from ..fields.protocol import Field
+from ..march.occupancy import OccupancyGrid
+from ..march.placing import place_samples, refine
+from ..march.quadrature import Composite, over_background
+from ..march.query import Evaluation
+from ..march.render import integrate, render_rays
+from ..march.samples import Samples
+from ..march.settings import MarchSettings
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
 from .loss_scale import LossScale

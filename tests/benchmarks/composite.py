@@ -23,13 +23,13 @@ import mitsuba as mi
 import numpy as np
 
 import mi_nerf
-from mi_nerf.backend import choose_variant
-from mi_nerf.field import NeuralFieldConfig
-from mi_nerf.network import NetworkConfig, initial_weights
+from mi_nerf.base.variants import choose_variant
+from mi_nerf.fields.network import NetworkConfig, initial_weights
+from mi_nerf.fields.neural import NeuralFieldConfig
+from mi_nerf.march.settings import MarchSettings
 from mi_nerf.plugins import crossing
-from mi_nerf.volume import MarchSettings
 from tests.benchmarks import machine
-from tests.fields import camera_dict
+from tests.support.fields import camera_dict
 
 _WIDTH, _PATHS = 256, 64
 

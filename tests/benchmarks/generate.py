@@ -27,21 +27,22 @@ import mitsuba as mi
 import numpy as np
 
 import mi_nerf
-from mi_nerf.backend import choose_variant
+from mi_nerf.base.variants import choose_variant
 from mi_nerf.generation import Options, generate
 from mi_nerf.generation.noise import mean_image
 from mi_nerf.generation.run import prepare
 from mi_nerf.generation.tracer import Tracer
-from mi_nerf.images import on_white
-from mi_nerf.metrics import to_8bit
-from mi_nerf.scene_file import SceneFile
-from mi_nerf.scene_library import find_scene
+from mi_nerf.images.metrics import to_8bit
+from mi_nerf.images.write import on_white
+from mi_nerf.scene_xml.library import find_scene
+from mi_nerf.scene_xml.scene_file import SceneFile
 from tests.benchmarks import machine
 
 _BARE_LOOP = """
 import sys
 import mi_nerf, mitsuba as mi, numpy as np
-from mi_nerf.cameras import Intrinsics, mitsuba_from_opengl, sensor_dict
+from mi_nerf.cameras.pinhole import Intrinsics, sensor_dict
+from mi_nerf.cameras.poses import mitsuba_from_opengl
 from mi_nerf.generation.viewpoints import around
 variant, path, size, views, spp = sys.argv[1], sys.argv[2], *map(int, sys.argv[3:])
 mi.set_variant(variant)

@@ -13,7 +13,7 @@ import tempfile
 from pathlib import Path
 
 from tests.benchmarks import machine
-from tests.test_gradients import difference_errors, gradient_setup, trainer_errors
+from tests.plugins.test_gradients import difference_errors, gradient_setup, trainer_errors
 
 
 def main() -> None:

@@ -20,12 +20,13 @@ import mitsuba as mi
 import numpy as np
 
 import mi_nerf
-from mi_nerf.backend import array_module, choose_variant
-from mi_nerf.cameras import Intrinsics, look_at, sensor_dict
-from mi_nerf.network import initial_weights
+from mi_nerf.base.variants import array_module, choose_variant
+from mi_nerf.cameras.pinhole import Intrinsics, sensor_dict
+from mi_nerf.cameras.poses import look_at
+from mi_nerf.fields.network import initial_weights
+from mi_nerf.march.settings import MarchSettings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.trainer import Trainer
-from mi_nerf.volume import MarchSettings
 from tests.benchmarks import machine, resident_megabytes
 from tests.benchmarks.published_step import synthetic_views
 

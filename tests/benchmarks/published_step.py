@@ -18,8 +18,9 @@ from pathlib import Path
 import drjit as dr
 import numpy as np
 
-from mi_nerf.backend import array_module, choose_variant
-from mi_nerf.cameras import Intrinsics, look_at
+from mi_nerf.base.variants import array_module, choose_variant
+from mi_nerf.cameras.pinhole import Intrinsics
+from mi_nerf.cameras.poses import look_at
 from mi_nerf.data import Dataset
 from mi_nerf.report.arithmetic import drjit_product_rate, numpy_product_rate, training_flop
 from mi_nerf.training.config import with_settings

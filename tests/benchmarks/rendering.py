@@ -21,16 +21,16 @@ import mitsuba as mi
 import numpy as np
 
 import mi_nerf  # noqa: F401  (registers the plugins)
-from mi_nerf.backend import array_module, choose_variant
-from mi_nerf.cameras import sensor_dict
+from mi_nerf.base.variants import array_module, choose_variant
+from mi_nerf.cameras.pinhole import sensor_dict
 from mi_nerf.data import load_dataset
-from mi_nerf.evaluation import reference_image
-from mi_nerf.metrics import psnr, to_8bit
-from mi_nerf.occupancy import OccupancyGrid
+from mi_nerf.images.metrics import psnr, to_8bit
+from mi_nerf.march.occupancy import OccupancyGrid
+from mi_nerf.march.view import display_image, render_view
+from mi_nerf.tasks.evaluate import reference_image
 from mi_nerf.training import run as training
 from mi_nerf.training.presets import preset
 from mi_nerf.training.run_folder import FIELD
-from mi_nerf.views import display_image, render_view
 from tests.benchmarks import data_folder, machine
 
 

@@ -21,14 +21,14 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerf.backend import choose_variant
+from mi_nerf.base.files import write_json
+from mi_nerf.base.variants import choose_variant
 from mi_nerf.data import load_dataset
-from mi_nerf.evaluation import evaluate, reference_image
-from mi_nerf.files import write_json
 from mi_nerf.generation import Options, generate
-from mi_nerf.metrics import psnr
-from mi_nerf.scene_library import find_scene
-from mi_nerf.target import open_target
+from mi_nerf.images.metrics import psnr
+from mi_nerf.scene_xml.library import find_scene
+from mi_nerf.tasks.evaluate import evaluate, reference_image
+from mi_nerf.tasks.target import open_target
 from mi_nerf.training import run as training
 from mi_nerf.training.config import with_settings
 from mi_nerf.training.presets import preset

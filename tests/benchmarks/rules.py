@@ -23,15 +23,18 @@ from typing import Any, get_args
 import drjit as dr
 import numpy as np
 
-from mi_nerf.backend import array_module, choose_variant
+from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.data import load_dataset
-from mi_nerf.quadrature import Rule, over_background
-from mi_nerf.target import open_target
+from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import Rule, over_background
+from mi_nerf.march.query import Evaluation
+from mi_nerf.march.render import integrate
+from mi_nerf.march.settings import MarchSettings
+from mi_nerf.tasks.target import open_target
 from mi_nerf.training.batches import RayBatch, RaySource, step_rng
-from mi_nerf.volume import Evaluation, MarchSettings, integrate, place_samples
 from tests.benchmarks import machine
-from tests.test_closed_form import JUMPS, VALUES
-from tests.test_rules import errors
+from tests.fields.test_closed_form import JUMPS, VALUES
+from tests.march.test_rules import errors
 
 RULES: tuple[Rule, ...] = get_args(Rule)
 FIELDS = {**VALUES, **{f"{kind}, edge 0": values for kind, values in JUMPS.items()}}

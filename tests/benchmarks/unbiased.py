@@ -14,13 +14,13 @@ import time
 
 import numpy as np
 
-from mi_nerf.backend import array_module, choose_variant
-from mi_nerf.closed_form import closed_form
-from mi_nerf.majorant import Majorants
-from tests import closed_forms as oracle
+from mi_nerf.base.variants import array_module, choose_variant
+from mi_nerf.estimators.majorant import Majorants
+from mi_nerf.fields.closed_form import closed_form
 from tests.benchmarks import machine
-from tests.test_closed_form import JUMPS, VALUES, directed, within
-from tests.test_tracking import estimates, z_scores
+from tests.estimators.test_tracking import estimates, z_scores
+from tests.fields.test_closed_form import JUMPS, VALUES, directed, within
+from tests.support import closed_forms as oracle
 
 FIELDS = {**VALUES, **{f"{kind}, edge 0": values for kind, values in JUMPS.items()}}
 RAYS = 50

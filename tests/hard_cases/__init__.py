@@ -3,9 +3,9 @@
     python -m tests.hard_cases
 
 prints the table of docs/stability.md. Every case is a function of the array types of a
-backend (such as ``drjit.llvm.ad``) that returns a few :class:`Finding`; tests/test_stability.py
-asserts what they must be. Usual formulas are those of :mod:`tests.naive`; what is right comes
-from closed forms in float64.
+backend (such as ``drjit.llvm.ad``) that returns a few :class:`Finding`; test_stability.py
+asserts what they must be. Usual formulas are those of :mod:`tests.support.naive`; what is right
+comes from closed forms in float64.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class Case:
 
     @property
     def test(self) -> str:
-        """The name of the test in tests/test_stability.py."""
+        """The name of the test in test_stability.py."""
         return f"test_row_{self.row:02d}_{self.measure.__name__}"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 
-from mi_nerf.backend import array_module, choose_variant
+from mi_nerf.base.variants import array_module, choose_variant
 from tests.hard_cases import fields
 from tests.hard_cases.cases import CASES
 

@@ -7,14 +7,17 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_nerf.closed_form import closed_form
-from mi_nerf.quadrature import sample_weights
-from mi_nerf.sampling import points_along, stratified
-from mi_nerf.volume import Evaluation, MarchSettings, integrate, place_samples
-from tests import closed_forms as oracle
-from tests import naive
-from tests.arrays import unit, vectors
+from mi_nerf.fields.closed_form import closed_form
+from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import sample_weights
+from mi_nerf.march.query import Evaluation
+from mi_nerf.march.render import integrate
+from mi_nerf.march.settings import MarchSettings
+from mi_nerf.march.strata import points_along, stratified
 from tests.hard_cases import Finding, relative
+from tests.support import closed_forms as oracle
+from tests.support import naive
+from tests.support.arrays import unit, vectors
 
 
 class Probe:

@@ -9,11 +9,11 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_nerf.activations import bounded_exp
-from mi_nerf.quadrature import composite, one_minus_exp, sample_weights
-from mi_nerf.sampling import stratified
-from tests import naive
+from mi_nerf.fields.activations import bounded_exp
+from mi_nerf.march.quadrature import composite, one_minus_exp, sample_weights
+from mi_nerf.march.strata import stratified
 from tests.hard_cases import Finding, relative
+from tests.support import naive
 
 Weigh = Callable[[Any, Any, int], tuple[Any, Any]]
 

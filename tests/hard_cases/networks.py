@@ -10,16 +10,16 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam as DrJitAdam
 
-from mi_nerf.activations import relu, sigmoid
-from mi_nerf.encoding import FourierEncoding, sincos_octave
-from mi_nerf.field import NeuralField, NeuralFieldConfig
-from mi_nerf.network import NetworkConfig, initial_weights
-from mi_nerf.quadrature import over_background
+from mi_nerf.fields.activations import relu, sigmoid
+from mi_nerf.fields.fourier import FourierEncoding, sincos_octave
+from mi_nerf.fields.network import NetworkConfig, initial_weights
+from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
+from mi_nerf.march.quadrature import over_background
 from mi_nerf.training.losses import squared_error
 from mi_nerf.training.optimizer import Adam
-from tests import naive
-from tests.arrays import vectors
 from tests.hard_cases import Finding, not_finite
+from tests.support import naive
+from tests.support.arrays import vectors
 
 SEEDS = 20
 PUBLISHED = NeuralFieldConfig(

@@ -8,20 +8,20 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_nerf.closed_form import closed_form
-from mi_nerf.ndc import Ndc
-from mi_nerf.quadrature import sample_weights
-from mi_nerf.sampling import (
-    box_interval,
-    inverse_transform,
-    points_along,
-    stratified,
-)
-from mi_nerf.volume import Evaluation, MarchSettings, integrate, place_samples
-from tests import naive
-from tests.arrays import unit, vectors
-from tests.boxes import awkward_rays, slow_interval
+from mi_nerf.cameras.ndc import Ndc
+from mi_nerf.fields.closed_form import closed_form
+from mi_nerf.march.importance import inverse_transform
+from mi_nerf.march.intervals import box_interval
+from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import sample_weights
+from mi_nerf.march.query import Evaluation
+from mi_nerf.march.render import integrate
+from mi_nerf.march.settings import MarchSettings
+from mi_nerf.march.strata import points_along, stratified
 from tests.hard_cases import Finding, not_finite, relative
+from tests.support import naive
+from tests.support.arrays import unit, vectors
+from tests.support.boxes import awkward_rays, slow_interval
 
 
 def empty_bins(ad: Any) -> list[Finding]:

@@ -11,8 +11,8 @@ import numpy as np
 from mi_nerf.training.config import OptimizerConfig
 from mi_nerf.training.losses import relative_error, squared_error
 from mi_nerf.training.schedule import learning_rate
-from tests import naive
 from tests.hard_cases import Finding
+from tests.support import naive
 
 STEPS = 100_000
 

@@ -1,0 +1,297 @@
+"""What the commands do, as functions: datasets, runs, measurements, pictures.
+
+Options have the names and defaults of the command line's. Without a ``variant``, the active
+Mitsuba variant holds if it is one that mi_nerf works with, otherwise the best of the machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import mitsuba as mi
+
+from . import generation
+from .base.checks import positive, valid_seed
+from .base.errors import InputError
+from .base.progress_bar import progress_bar
+from .base.variants import available_variants, choose_variant
+from .data import Dataset
+from .march.view import Image
+from .scene_xml.library import find_scene
+from .tasks import describe as info
+from .tasks import evaluate as evaluation
+from .tasks import render as rendering
+from .tasks.target import Target, open_target
+from .training import run as training
+from .training.config import TrainConfig, with_settings
+from .training.plain import as_text
+from .training.presets import preset as preset_config
+from .training.run import Run
+from .training.run_folder import CONFIG, read_config
+
+Settings = Mapping[str, Any] | Sequence[str]
+
+
+def active_variant(requested: str | None = None) -> str:
+    """``requested``, the active Mitsuba variant, or the best one of this machine.
+
+    Raises:
+        InputError: if the requested one is not supported, or nothing is.
+    """
+    active = mi.variant()
+    if requested is None and active in available_variants():
+        return str(active)
+    return choose_variant(requested)
+
+
+def generate(
+    scene: str | Path,
+    out: str | Path,
+    *,
+    protocol: Literal["realistic360", "diffuse360", "forward"] | None = None,
+    train: int | None = None,
+    val: int | None = None,
+    test: int | None = None,
+    size: tuple[int, int] | None = None,
+    spp: int | None = None,
+    seed: int = 0,
+    cameras: Literal["hemisphere", "sphere"] | None = None,
+    up: Literal["x", "y", "z"] | None = None,
+    center: tuple[float, float, float] | None = None,
+    radius: float | None = None,
+    parameters: Mapping[str, str] | None = None,
+    resume: bool = False,
+    variant: str | None = None,
+    show: bool = True,
+) -> dict[str, Any]:
+    """Path-traces a dataset from a Mitsuba scene, as ``mi-nerf generate``.
+
+    Args:
+        scene: an XML file, or the name of a scene that comes with mi_nerf.
+        out: folder of the dataset: new or empty, or with ``resume`` one that was begun.
+        protocol: the paper's kind of dataset; default: the scene's own, or realistic360.
+        train, val, test: numbers of views; default: the protocol's.
+        size: width and height in pixels.
+        spp: samples a pixel; default: those of the scene's sampler.
+        seed: of camera positions and of the noise.
+        cameras, up, center, radius: where 360-degree cameras stand, in scene units.
+        parameters: values of the scene's ``$parameters``.
+        show: say what is made, and how far it is.
+
+    Returns:
+        The content of ``dataset.json``. ``complete`` is false after an interruption;
+        ``["noise"]["test"]["psnr_ceiling"]`` is the PSNR in dB that the converged images
+        themselves would get.
+
+    Raises:
+        InputError: if anything is not as expected; existing files are as they were.
+    """
+    valid_seed(seed)
+    options = generation.Options(
+        protocol=protocol,
+        train=train,
+        val=val,
+        test=test,
+        size=size,
+        spp=spp,
+        seed=seed,
+        cameras=cameras,
+        up=up,
+        center=center,
+        radius=radius,
+    )
+    path = find_scene(str(scene))
+    return generation.generate(
+        path,
+        out,
+        active_variant(variant),
+        options,
+        parameters=parameters,
+        resume=resume,
+        show=show,
+    )
+
+
+def start(
+    data: str | Path,
+    out: str | Path,
+    *,
+    preset: str = "nerf",
+    max_seconds: float | None = None,
+    steps: int | None = None,
+    downscale: int = 1,
+    seed: int = 0,
+    settings: Settings = (),
+    resume: bool = False,
+    variant: str | None = None,
+    started: float | None = None,
+) -> Run:
+    """Opens a run, as ``mi-nerf train``; train it with ``run.train()`` or ``run.reports()``.
+
+    Args:
+        data: folder of a dataset.
+        out: folder of the run; created.
+        preset: ``nerf``, ``fast``, ``paper``, or ``auto``, which now begins to train
+            several models.
+        max_seconds, steps: the budget, wall-clock seconds of training or steps; 600 seconds if
+            neither is given.
+        downscale: average images over blocks of so many pixels squared.
+        seed: of initial weights, rays and samples.
+        settings: any other setting by its name, ``{"network.width": 128}``, or as ``--set``
+            takes them, ``["network.width=128"]``.
+        resume: go on with the run in ``out``, with its own settings.
+        started: the value of ``time.monotonic()`` from which seconds count; default: they count
+            while this function and training are at work.
+
+    Raises:
+        InputError: if the folder already holds a run, the data cannot be read, or a setting
+            is unknown or out of range.
+    """
+    assignments = _assignments(settings)
+    config = replace(
+        preset_config(preset), seed=valid_seed(seed), downscale=positive("downscale", downscale)
+    )
+    config = with_settings(config, assignments)
+    for name, value in (("steps", steps), ("max_seconds", max_seconds)):
+        if value is not None:
+            config = replace(config, **{name: positive(name.replace("_", "-"), value)})
+    if not resume and config.steps is None and config.max_seconds is None:
+        config = replace(config, max_seconds=600.0)
+    if resume and (Path(out) / CONFIG).exists():
+        _require_same_settings(Path(out), config, assignments)
+    return training.start(
+        data,
+        out,
+        config,
+        active_variant(variant),
+        resume=resume,
+        started=started,
+        given={assignment.partition("=")[0] for assignment in assignments},
+    )
+
+
+def evaluate(
+    target: str | Path | Target | Run,
+    *,
+    data: str | Path | None = None,
+    split: str = "test",
+    downscale: int | None = None,
+    views: int | None = None,
+    images: str | Path | None = None,
+    variant: str | None = None,
+    on_image: Callable[[dict[str, Any], int], None] | None = None,
+) -> dict[str, Any]:
+    """Measures held-out views by the nerf2020 protocol, as ``mi-nerf eval``.
+
+    Args:
+        target: a run or its folder, or a field file (then with ``data``).
+        data, downscale: dataset and scale; default: as the run was trained.
+        split: which views.
+        views: only so many, evenly spread.
+        images: write the rendered views to this folder, as 8-bit PNG on white.
+        on_image: called with each image's result and the number of images.
+
+    Returns:
+        The record that ``mi-nerf eval --json`` writes: ``["mean"]["psnr"]`` in dB,
+        ``["mean"]["ssim"]``, ``["images"]``, ``["seconds_per_view"]``, ``["queries_per_ray"]``.
+
+    Raises:
+        InputError: if there is no dataset to compare with, or it cannot be read.
+    """
+    return evaluation.evaluate(
+        _target(target),
+        active_variant(variant),
+        data=data,
+        split=split,
+        downscale=downscale,
+        views=views,
+        images=images,
+        on_image=on_image,
+    )
+
+
+def render(
+    target: str | Path | Target | Run,
+    *,
+    path: Literal["orbit", "spiral", "test"] | None = None,
+    frames: int | None = None,
+    size: tuple[int, int] | None = None,
+    spp: int | None = None,
+    variant: str | None = None,
+    show: bool = True,
+) -> list[Image]:
+    """Renders a run along a camera path, or a Mitsuba XML scene, as ``mi-nerf render``.
+
+    Args:
+        target: a run or its folder, or an XML file.
+        path: camera path; default: orbit for runs (spiral for forward-facing captures), the
+            scene's own sensors for XML.
+        frames: along the path; default: 60, all for ``test``.
+        size: width and height in pixels.
+        spp: samples a pixel.
+        show: show a progress bar.
+
+    Returns:
+        Linear premultiplied RGBA, (H, W, 4) each; :func:`mi_nerf.on_white` makes them visible.
+
+    Raises:
+        InputError: if the target or its dataset cannot be read.
+    """
+    source = target if isinstance(target, Target) else _path(target)
+    count, images = rendering.frames_of(
+        source, active_variant(variant), path=path, frames=frames, size=size, spp=spp
+    )
+    result = []
+    with progress_bar("render", "frame", count, show=show) as bar:
+        for _, image in images:
+            result.append(image)
+            bar.update()
+    return result
+
+
+def pictures(dataset: Dataset) -> list[Image]:
+    """The views of a dataset as :func:`evaluate` sees them: (H, W, 3) sRGB on white, 8 bits."""
+    return [evaluation.reference_image(dataset, k) for k in range(len(dataset))]
+
+
+def describe(target: str | Path | None = None) -> str:
+    """What this machine offers, or what a run, checkpoint, field or dataset holds.
+
+    Raises:
+        InputError: if the target is nothing that mi_nerf knows.
+    """
+    return info.system() if target is None else info.describe(Path(target))
+
+
+def _path(target: str | Path | Run) -> Path:
+    return target.folder if isinstance(target, Run) else Path(target)
+
+
+def _target(target: str | Path | Target | Run) -> Target:
+    return target if isinstance(target, Target) else open_target(_path(target))
+
+
+def _assignments(settings: Settings) -> list[str]:
+    """Settings as ``--set`` takes them."""
+    if isinstance(settings, Mapping):
+        return [f"{name}={as_text(value)}" for name, value in settings.items()]
+    return list(settings)
+
+
+def _require_same_settings(folder: Path, given: TrainConfig, assignments: list[str]) -> None:
+    """Refuses options that a resumed run, which keeps its settings, would ignore."""
+    recorded, _ = read_config(folder)
+    wanted = with_settings(recorded, assignments)
+    usual = TrainConfig()
+    for name in ("preset", "seed", "downscale"):
+        if getattr(given, name) != getattr(usual, name):
+            wanted = replace(wanted, **{name: getattr(given, name)})
+    wanted = replace(wanted, steps=recorded.steps, max_seconds=recorded.max_seconds)
+    if wanted != recorded:
+        raise InputError(
+            f"{folder}: a resumed run keeps its settings, expected no other --preset, "
+            "--seed, --downscale or --set than it was started with"
+        )

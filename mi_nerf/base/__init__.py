@@ -1,0 +1,1 @@
+"""What everything else stands on: arrays, boxes, colours, files, errors, the machine."""

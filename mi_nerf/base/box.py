@@ -1,0 +1,17 @@
+"""Axis-aligned boxes, and grids of cells in them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+Corner = tuple[float, float, float]
+
+
+def grid_shape(lower: Corner, upper: Corner, resolution: int) -> tuple[int, int, int]:
+    """Nearly cubic cells, ``resolution`` of them along the longest side."""
+    size = np.asarray(upper, float) - np.asarray(lower, float)
+    shape = np.maximum(1, np.rint(resolution * size / size.max())).astype(int)
+    return int(shape[0]), int(shape[1]), int(shape[2])

@@ -1,0 +1,63 @@
+"""What a figure was measured on: the processor, its cores, the versions."""
+
+from __future__ import annotations
+
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+import drjit as dr
+
+
+def processor() -> str:
+    """The name of the CPU, as far as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+def cores() -> int:
+    """How many cores this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on this system
+        return os.cpu_count() or 1
+
+
+def machine(variant: str) -> dict[str, Any]:
+    """What reports record of the machine; plain JSON values."""
+    import mitsuba as mi
+
+    from .._version import __version__
+
+    return {
+        "processor": processor(),
+        "cores": cores(),
+        "gpu": _gpu() if variant.startswith("cuda") else None,
+        "variant": variant,
+        "versions": {
+            "mi_nerf": __version__,
+            "mitsuba": mi.__version__,
+            "drjit": dr.__version__,
+            "python": platform.python_version(),
+        },
+    }
+
+
+def machine_line(record: dict[str, Any]) -> str:
+    """A record of :func:`machine` in one line, for captions."""
+    device = record["gpu"] or f"{record['cores']} cores of {record['processor']}"
+    return f"{device}, {record['variant']}"
+
+
+def _gpu() -> str:
+    """The NVIDIA GPUs of this machine, as their driver lists them."""
+    names = []
+    for file in sorted(Path("/proc/driver/nvidia/gpus").glob("*/information")):
+        for line in file.read_text().splitlines():
+            if line.startswith("Model:"):
+                names.append(line.partition(":")[2].strip())
+    return ", ".join(names) or "NVIDIA GPU"

@@ -1,0 +1,1 @@
+"""A pixel becomes a ray: poses, pinhole cameras, normalised device coordinates, paths."""

@@ -1,0 +1,1 @@
+"""The same integral by other means: a reference, and without bias."""

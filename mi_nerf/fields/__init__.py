@@ -1,0 +1,1 @@
+"""Position and direction become density and colour."""

@@ -1,0 +1,203 @@
+"""A neural radiance field: features of position and direction into an MLP."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..base.arrays import upload, vector3_type
+from ..base.box import Corner
+from ..base.color import ColorSpace
+from ..base.kernel_stages import settled, stage
+from ..cameras.ndc import Ndc
+from . import network
+from .activations import ColorActivation, DensityActivation, apply_activation
+from .fourier import FourierEncoding, stack_rows
+from .fused_network import FusedNetwork, HalfNetwork, worth_fusing
+from .hash_grid import HashGrid, HashGridConfig
+from .network import NetworkConfig
+from .noise import DensityNoise
+
+
+@dataclass(frozen=True)
+class NeuralFieldConfig:
+    """Everything that describes a neural field, apart from its weights."""
+
+    lower: Corner = (-1.0, -1.0, -1.0)  # the box, in scene units
+    upper: Corner = (1.0, 1.0, 1.0)
+    color_space: ColorSpace = "srgb"
+    position: FourierEncoding = field(default_factory=FourierEncoding)
+    grid: HashGridConfig | None = None  # trained features of the position, besides the others
+    direction: FourierEncoding = field(default_factory=lambda: FourierEncoding(frequencies=4))
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    density_activation: DensityActivation = "softplus"
+    density_shift: float = -1.0  # added to the raw density before its activation
+    density_scale: float = 1.0  # 1/scene unit: the density of activation output 1
+    color_activation: ColorActivation = "sigmoid"
+    input_center: Corner = (0.0, 0.0, 0.0)  # the network sees (p − center) · scale
+    input_scale: float = 1.0
+    ndc: Ndc | None = None  # forward-facing captures: box and positions are in its space
+
+    def __post_init__(self) -> None:
+        if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
+            raise ValueError(f"box: lower {self.lower} must lie below upper {self.upper}")
+        for name, value, choices in (
+            ("density_activation", self.density_activation, ("softplus", "relu", "exp")),
+            ("color_activation", self.color_activation, ("sigmoid", "softplus", "exp")),
+            ("color_space", self.color_space, ("srgb", "linear")),
+        ):
+            if value not in choices:
+                raise ValueError(f"{name}={value!r}, expected one of {', '.join(choices)}")
+
+    @property
+    def position_size(self) -> int:
+        """Number of features of a position."""
+        return self.position.size + (0 if self.grid is None else self.grid.size)
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes of all parameters."""
+        shapes = self.network.shapes(self.position_size, self.direction.size)
+        if self.grid is not None:
+            shapes[network.GRID] = (self.grid.entries(), self.grid.features)
+        return shapes
+
+    def parameter_count(self) -> int:
+        """Number of trainable scalars."""
+        return sum(int(np.prod(shape)) for shape in self.shapes().values())
+
+    def in_box(self, lower: Corner, upper: Corner) -> NeuralFieldConfig:
+        """The same model over another box: inputs and densities scale with it.
+
+        The longest side spans [−1, 1], so every axis has the same frequencies, and
+        densities count per half of that side: what the network has to learn does not
+        depend on the unit of the scene.
+        """
+        half = max(b - a for a, b in zip(lower, upper, strict=True)) / 2
+        x, y, z = ((a + b) / 2 for a, b in zip(lower, upper, strict=True))
+        return dataclasses.replace(
+            self,
+            lower=lower,
+            upper=upper,
+            input_center=(x, y, z),
+            input_scale=1 / half,
+            density_scale=self.density_scale * self._half_side() / half,
+        )
+
+    def _half_side(self) -> float:
+        return max(b - a for a, b in zip(self.lower, self.upper, strict=True)) / 2
+
+
+class NeuralField:
+    """Features of position and direction into an MLP (NeRF Sec. 4 and 5.1)."""
+
+    coarse: NeuralField | None = None  # says where this one is worth sampling (Sec. 5.2)
+    noise: DensityNoise | None = None  # added to raw densities, in training
+    loss_scale: Any = None  # one value, in training: the network runs in half precision
+
+    def __init__(
+        self,
+        config: NeuralFieldConfig,
+        weights: Mapping[str, np.ndarray[Any, Any]],
+        tensor_type: Any,
+    ) -> None:
+        """Uploads ``weights`` as ``tensor_type`` (such as ``mi.TensorXf``).
+
+        Raises:
+            ValueError: if a tensor is missing, unexpected or of the wrong shape.
+        """
+        self.config = config
+        self.lower, self.upper, self.color_space = config.lower, config.upper, config.color_space
+        self.ndc = config.ndc
+        shapes = config.shapes()
+        if unknown := sorted(set(weights) - set(shapes)):
+            raise ValueError(f"unexpected tensor '{unknown[0]}' for this architecture")
+        for name, shape in shapes.items():
+            if name not in weights:
+                raise ValueError(f"tensor '{name}' is missing, expected shape {shape}")
+            if weights[name].shape != shape:
+                raise ValueError(f"tensor '{name}' is {weights[name].shape}, expected {shape}")
+        self._weights = {name: upload(tensor_type, weights[name]) for name in shapes}
+        self._grid = None
+        if config.grid is not None:
+            self._grid = HashGrid(config.grid, type(self._weights[network.GRID].array))
+
+    @classmethod
+    def create(cls, config: NeuralFieldConfig, seed: int, tensor_type: Any) -> NeuralField:
+        """A field with freshly initialised weights."""
+        return cls(config, network.initial_weights(config.shapes(), seed), tensor_type)
+
+    def parameters(self) -> dict[str, Any]:
+        """The network's tensors by name; assign with ``tensor[:] = …`` or replace the entry."""
+        return self._weights
+
+    def weights(self) -> dict[str, np.ndarray[Any, Any]]:
+        """A copy of all tensors as NumPy arrays."""
+        return {name: np.array(tensor) for name, tensor in self._weights.items()}
+
+    def density(self, p: Any) -> Any:
+        """σ at N points, in 1/scene unit."""
+        return self._density(network.density_head(self._weights, self._trunk(p)), p)
+
+    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+        """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
+        config = self.config
+        if self.loss_scale is not None:
+            return self._answer(HalfNetwork(config.network, self._weights, self.loss_scale), p, d)
+        h = self._trunk(p)
+        with stage("encoding"):
+            direction = settled(config.direction(d)) if config.network.view_dependent else None
+        raw = network.color_head(config.network, self._weights, h, direction)
+        return self._density(network.density_head(self._weights, h), p), self._color(raw)
+
+    def fused(self, emission: bool = True) -> Callable[..., Any] | None:
+        """:meth:`density_emission` of the weights as they are, as one kernel without gradients.
+
+        Without ``emission``, :meth:`density`. ``None`` where that would be slower.
+        """
+        config = self.config
+        if not worth_fusing(config.network, type(next(iter(self._weights.values())).array)):
+            return None
+        fused = FusedNetwork(config.network, self._weights)
+
+        def density_emission(p: Any, d: Any) -> tuple[Any, list[Any]]:
+            return self._answer(fused, p, d)
+
+        def density(p: Any) -> Any:
+            return self._density(fused.density(self._features(p)), p)
+
+        return density_emission if emission else density
+
+    def _answer(self, fused: FusedNetwork, p: Any, d: Any) -> tuple[Any, list[Any]]:
+        config = self.config
+        direction = config.direction.features(d) if config.network.view_dependent else None
+        density, color = fused(self._features(p), direction)
+        return self._density(density, p), self._color(color)
+
+    def _trunk(self, p: Any) -> Any:
+        with stage("encoding"):
+            position = settled(stack_rows(self._features(p)))
+        return network.trunk(self.config.network, self._weights, position)
+
+    def _features(self, p: Any) -> list[Any]:
+        config = self.config
+        unit = vector3_type(type(p[0]))(
+            *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
+        )
+        features = config.position.features(unit)
+        if self._grid is not None:
+            features += self._grid.features(unit, self._weights[network.GRID])
+        return features
+
+    def _color(self, raw: list[Any]) -> list[Any]:
+        return [apply_activation(self.config.color_activation, c) for c in raw]
+
+    def _density(self, raw: Any, p: Any) -> Any:
+        config = self.config
+        raw = raw + config.density_shift
+        if self.noise is not None:
+            raw = raw + self.noise.at(p)
+        return apply_activation(config.density_activation, raw) * config.density_scale

@@ -1,0 +1,36 @@
+"""Radiance fields: density from position alone, emission from position and direction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol, runtime_checkable
+
+from ..base.box import Corner
+from ..base.color import ColorSpace
+from ..cameras.ndc import Ndc
+
+
+@runtime_checkable
+class Field(Protocol):
+    """What quadrature, plugins and training need of any radiance field.
+
+    Positions are 3-vectors in the field's own coordinates (scene units), directions
+    are unit 3-vectors of travel along the ray; N of each give N results.
+
+    With ``ndc``, the box, positions and the unit of density are those of normalised
+    device coordinates; directions are still the ones before projection.
+    """
+
+    lower: Corner  # corners of the box outside which the field is empty
+    upper: Corner
+    color_space: ColorSpace  # in which emission is expressed and composited
+    ndc: Ndc | None  # the projection in whose space the field lives; None: scene space
+
+    def density(self, p: Any) -> Any:
+        """σ ≥ 0 at N points, in 1/scene unit."""
+
+    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+        """σ and the three channels of the emitted colour at N points along ``d``."""
+
+    def parameters(self) -> Mapping[str, Any]:
+        """Differentiable parameters by name; tensors that may be updated in place."""

@@ -1,0 +1,1 @@
+"""Files that hold fields: this program's and those of others."""

@@ -1,0 +1,395 @@
+"""Networks trained by two PyTorch ports of the original code, as fields of mi_nerf.
+
+Depths, widths, the skip layer and the number of octaves follow from the shapes of the
+tensors. What does not follow is what the two codes fix: rectified density, logistic
+colour, sRGB, frequencies 2^k (without π), directions of length 1, no scaling of space.
+Their densities are per unit of length of world space, as here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import drjit as dr
+import numpy as np
+
+from ..base.box import Corner, grid_shape
+from ..base.errors import InputError
+from ..base.tensor_file import Arrays
+from ..base.variants import array_module
+from ..fields.fourier import Convention, FourierEncoding
+from ..fields.network import NetworkConfig
+from ..fields.neural import NeuralFieldConfig
+from ..march.occupancy import OccupancyGrid
+from ..march.settings import MarchSettings
+from .field_file import FieldFile
+from .torch_file import Checkpoint, read_checkpoint
+from .torch_pickle import StoredTensor
+
+Which = Literal["fine", "coarse"]
+
+# Optical thickness below which a cell counts as empty, as in training, and how often a
+# random point of each cell is looked at before it does.
+_THRESHOLD = 0.01
+_LOOKS = 4
+_BLOCK = 16384
+
+
+@dataclass(frozen=True)
+class ImportSettings:
+    """What a checkpoint does not say."""
+
+    network: Which | None = None  # none: the fine one, the coarse one placing its samples
+    # The objects of nerf_synthetic, which these codes are mostly trained on, lie within.
+    lower: Corner = (-1.5, -1.5, -1.5)
+    upper: Corner = (1.5, 1.5, 1.5)
+    samples: int | None = None  # strata a ray; none: 64, or 256 of a single network
+    fine: int | None = None  # more, where the coarse network sees something; none: 128
+    convention: Convention = "one"  # frequencies 2^k, 2^k·π or 2^k·2π
+
+
+def import_network(path: str | Path, settings: ImportSettings) -> FieldFile:
+    """Reads a checkpoint of either layout as a field; runs nothing that it contains.
+
+    With two networks of one architecture, the coarse one places the fine one's samples.
+
+    Raises:
+        InputError: if it is damaged, of another layout, or an architecture that a field
+            cannot have.
+    """
+    checkpoint = read_checkpoint(path)
+    layout, key = _find(checkpoint, settings.network)
+    config, weights = _read_network(checkpoint, layout, key, settings)
+    coarse, coarse_key = None, layout.keys["coarse"]
+    if settings.network is None and key != coarse_key and coarse_key in checkpoint.content:
+        coarse_config, coarse = _read_network(checkpoint, layout, coarse_key, settings)
+        coarse = coarse if coarse_config == config else None
+    samples, fine = (64, 128) if coarse is not None else (256, 0)
+    march = MarchSettings(
+        samples=samples if settings.samples is None else settings.samples,
+        fine=fine if settings.fine is None or coarse is None else settings.fine,
+    )
+    provenance = {"imported_from": Path(path).name, "state_dict": key}
+    return FieldFile(config, weights, march=march, provenance=provenance, coarse=coarse)
+
+
+def _read_network(
+    checkpoint: Checkpoint, layout: _Layout, key: str, settings: ImportSettings
+) -> tuple[NeuralFieldConfig, Arrays]:
+    """One network of a checkpoint: its architecture and its weights."""
+    tensors = _Tensors(checkpoint, key)
+    parts = layout.read(tensors)
+    tensors.require_all_used()
+    network, weights = _assemble(tensors, parts, layout)
+    position = _encoding(tensors, parts.trunk[0].inputs, "position", settings.convention)
+    direction = FourierEncoding(frequencies=4, convention=settings.convention)
+    if network.view_dependent:
+        size = parts.view[0].inputs - network.width
+        direction = _encoding(tensors, size, "direction", settings.convention)
+    config = NeuralFieldConfig(
+        lower=settings.lower,
+        upper=settings.upper,
+        position=position,
+        direction=direction,
+        network=network,
+        density_activation="relu",
+        density_shift=0.0,
+    )
+    return config, weights
+
+
+def occupied_cells(contents: FieldFile, variant: str, resolution: int) -> np.ndarray[Any, Any]:
+    """(X, Y, Z) booleans: where the field was seen to be dense, and the cells around.
+
+    Args:
+        resolution: cells along the longest side of the box.
+    """
+    backend = array_module(variant)
+    field, _ = contents.build(backend)
+    shape = grid_shape(field.lower, field.upper, resolution)
+    grid = OccupancyGrid(field.lower, field.upper, np.ones(shape, bool), backend.Float)
+    rng = dr.rng(0)
+    for turn in range(_LOOKS * -(-math.prod(shape) // _BLOCK)):
+        grid.refresh(field, rng, turn, queries=2 * _BLOCK, threshold=_THRESHOLD, decay=1.0)
+    cells = grid.mask()
+    # What is thin and was missed lies beside what was seen.
+    for axis in range(3):
+        padded = np.pad(cells, [(int(i == axis), int(i == axis)) for i in range(3)])
+        near = [np.take(padded, range(k, k + shape[axis]), axis) for k in range(3)]
+        cells = near[0] | near[1] | near[2]
+    return cells
+
+
+# --------------------------------------------------------------------------
+#   Layouts
+# --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """One layer y = W·x + b; ``name`` as in the checkpoint."""
+
+    name: str
+    weight: np.ndarray[Any, Any]  # (outputs, inputs)
+    bias: np.ndarray[Any, Any]
+
+    @property
+    def outputs(self) -> int:
+        return int(self.weight.shape[0])
+
+    @property
+    def inputs(self) -> int:
+        return int(self.weight.shape[1])
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The layers of a network, by what they do."""
+
+    trunk: list[_Linear]
+    density: _Linear
+    feature: _Linear | None
+    view: list[_Linear]
+    color: _Linear
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How one code names its networks and orders what it concatenates."""
+
+    keys: dict[Which, str]
+    read: Callable[[_Tensors], _Parts]
+    feature_relu: bool
+    position_first: bool  # at the skip, γ(x) comes before the trunk's activations
+
+
+class _Tensors:
+    """One state dict of a checkpoint; keeps track of what was used."""
+
+    def __init__(self, checkpoint: Checkpoint, key: str) -> None:
+        self.where = f"{checkpoint.path}: {key}"
+        state = checkpoint.content[key]
+        if not isinstance(state, dict):
+            raise InputError(f"{self.where}: holds no tensors, expected a state dict")
+        # torch.nn.DataParallel puts 'module.' before every name.
+        self._state = {str(name).removeprefix("module."): value for name, value in state.items()}
+        self._checkpoint = checkpoint
+        self._unused = set(self._state)
+
+    def __contains__(self, layer: str) -> bool:
+        return f"{layer}.weight" in self._state
+
+    def linear(self, name: str) -> _Linear:
+        """The layer ``name``, in double precision."""
+        weight, bias = self._array(f"{name}.weight"), self._array(f"{name}.bias")
+        if weight.ndim != 2 or bias.shape != weight.shape[:1] or not weight.size:
+            raise InputError(
+                f"{self.where}: '{name}' has weights {weight.shape} and biases {bias.shape}, "
+                "expected (outputs, inputs) and (outputs,)"
+            )
+        return _Linear(name, weight, bias)
+
+    def layers(self, name: str) -> list[_Linear]:
+        """The layers ``name.0``, ``name.1``, …; at least one."""
+        result = [self.linear(f"{name}.0")]
+        while f"{name}.{len(result)}" in self:
+            result.append(self.linear(f"{name}.{len(result)}"))
+        return result
+
+    def ignore(self, prefix: str) -> None:
+        """Tensors that the code keeps without using them."""
+        self._unused = {name for name in self._unused if not name.startswith(prefix)}
+
+    def require_all_used(self) -> None:
+        """Refuses networks with more layers than were asked for."""
+        if self._unused:
+            raise InputError(
+                f"{self.where}: unexpected tensor '{min(self._unused)}' for this layout"
+            )
+
+    def _array(self, name: str) -> np.ndarray[Any, Any]:
+        if name not in self._state:
+            raise InputError(f"{self.where}: tensor '{name}' is missing")
+        self._unused.discard(name)
+        tensor = self._state[name]
+        if not isinstance(tensor, StoredTensor):
+            raise InputError(f"{self.where}: '{name}' is no tensor")
+        array = self._checkpoint.array(tensor)
+        if array.dtype.kind != "f" or not np.isfinite(array).all():
+            what = "infinite or undefined" if array.dtype.kind == "f" else str(array.dtype)
+            raise InputError(
+                f"{self.where}: tensor '{name}' holds {what} numbers, "
+                "expected finite ones of type float16, float32 or float64"
+            )
+        return array.astype(np.float64)
+
+
+def _read_original(tensors: _Tensors) -> _Parts:
+    """The port of the original code: pts_linears, views_linears, and heads."""
+    trunk = tensors.layers("pts_linears")
+    if "output_linear" in tensors:  # trained without directions
+        tensors.ignore("views_linears.")
+        density, color = _split_output(tensors, "output_linear")
+        return _Parts(trunk, density, None, [], color)
+    return _Parts(
+        trunk,
+        tensors.linear("alpha_linear"),
+        tensors.linear("feature_linear"),
+        tensors.layers("views_linears"),
+        tensors.linear("rgb_linear"),
+    )
+
+
+def _read_flexible(tensors: _Tensors) -> _Parts:
+    """The flexible model of the other code: layer1, layers_xyz, layers_dir, and heads.
+
+    Nothing comes between layer1 and layers_xyz.0, so they are one layer: the product.
+    """
+    first, rest = tensors.linear("layer1"), tensors.layers("layers_xyz")
+    second = _sized(tensors, rest[0], rest[0].outputs, first.outputs)
+    product = _Linear(
+        second.name, second.weight @ first.weight, second.weight @ first.bias + second.bias
+    )
+    trunk = [product, *rest[1:]]
+    if "fc_out" in tensors:  # trained without directions
+        density, color = _split_output(tensors, "fc_out")
+        return _Parts(trunk, density, None, [], color)
+    return _Parts(
+        trunk,
+        tensors.linear("fc_alpha"),
+        tensors.linear("fc_feat"),
+        tensors.layers("layers_dir"),
+        tensors.linear("fc_rgb"),
+    )
+
+
+def _split_output(tensors: _Tensors, name: str) -> tuple[_Linear, _Linear]:
+    """Density and colour from one layer of outputs r, g, b, σ and perhaps an unused one."""
+    both = tensors.linear(name)
+    if both.outputs not in (4, 5):
+        raise InputError(f"{tensors.where}: '{name}' has {both.outputs} outputs, expected 4 or 5")
+    color = _Linear(name, both.weight[:3], both.bias[:3])
+    return _Linear(name, both.weight[3:4], both.bias[3:4]), color
+
+
+_LAYOUTS = (
+    _Layout(
+        {"coarse": "network_fn_state_dict", "fine": "network_fine_state_dict"},
+        _read_original,
+        feature_relu=False,
+        position_first=True,
+    ),
+    _Layout(
+        {"coarse": "model_coarse_state_dict", "fine": "model_fine_state_dict"},
+        _read_flexible,
+        feature_relu=True,
+        position_first=False,
+    ),
+)
+
+
+def _find(checkpoint: Checkpoint, wanted: Which | None) -> tuple[_Layout, str]:
+    """The layout, and the name of the state dict to read."""
+    for layout in _LAYOUTS:
+        present = [w for w, key in layout.keys.items() if checkpoint.content.get(key) is not None]
+        if not present:
+            continue
+        which = wanted or ("fine" if "fine" in present else "coarse")
+        if which not in present:
+            raise InputError(
+                f"{checkpoint.path}: holds no {which} network, expected --network {present[0]}"
+            )
+        return layout, layout.keys[which]
+    found = ", ".join(sorted(str(key) for key in checkpoint.content)[:5]) or "nothing"
+    expected = " or ".join(layout.keys["coarse"] for layout in _LAYOUTS)
+    raise InputError(f"{checkpoint.path}: holds {found}, expected {expected}")
+
+
+# --------------------------------------------------------------------------
+#   From layers to a network
+# --------------------------------------------------------------------------
+
+
+def _assemble(tensors: _Tensors, parts: _Parts, layout: _Layout) -> tuple[NetworkConfig, Arrays]:
+    """The shape of the network, and its weights by the names of mi_nerf."""
+    width = parts.trunk[0].outputs
+    skip, weights = _trunk(tensors, parts.trunk, layout.position_first)
+    _put(weights, "density", _sized(tensors, parts.density, 1, width))
+    if parts.feature is not None:
+        _put(weights, "feature", _sized(tensors, parts.feature, width, width))
+    size, seen = width, 0
+    for i, layer in enumerate(parts.view):
+        if i == 0:
+            seen = layer.inputs - width
+            size = width + max(seen, 0)
+        _put(weights, f"view_{i}", _sized(tensors, layer, parts.view[0].outputs, size))
+        size = layer.outputs
+    if seen > 0:  # after the feature, in both codes
+        both = weights["view_0.weight"]
+        weights["view_0.weight"] = both[:, :width]
+        weights["view_0.direction_weight"] = both[:, width:]
+    _put(weights, "color", _sized(tensors, parts.color, 3, size))
+    network = NetworkConfig(
+        depth=len(parts.trunk),
+        width=width,
+        skip=skip,
+        feature_layer=parts.feature is not None,
+        feature_relu=parts.feature is not None and layout.feature_relu,
+        view_depth=len(parts.view),
+        view_width=parts.view[0].outputs if parts.view else 1,
+        view_dependent=seen > 0,
+    )
+    return network, {name: array.astype(np.float32) for name, array in weights.items()}
+
+
+def _trunk(tensors: _Tensors, layers: list[_Linear], position_first: bool) -> tuple[int, Arrays]:
+    """The skip layer, −1 for none, and the weights of the trunk."""
+    position, width = layers[0].inputs, layers[0].outputs
+    weights: Arrays = {}
+    skips = [i for i, layer in enumerate(layers) if i and layer.inputs == width + position]
+    if len(skips) > 1:
+        raise InputError(
+            f"{tensors.where}: '{layers[skips[0]].name}' and '{layers[skips[1]].name}' both see "
+            "the position again, expected one such layer at most"
+        )
+    for i, layer in enumerate(layers):
+        inputs = position if i == 0 else width + position * (i in skips)
+        _put(weights, f"trunk_{i}", _sized(tensors, layer, width, inputs))
+        if i in skips:
+            cut = position if position_first else width
+            left, right = layer.weight[:, :cut], layer.weight[:, cut:]
+            seen, before = (left, right) if position_first else (right, left)
+            weights[f"trunk_{i}.weight"] = before
+            weights[f"trunk_{i}.position_weight"] = seen
+    return (skips[0] if skips else -1), weights
+
+
+def _put(weights: Arrays, name: str, layer: _Linear) -> None:
+    weights[f"{name}.weight"], weights[f"{name}.bias"] = layer.weight, layer.bias
+
+
+def _sized(tensors: _Tensors, layer: _Linear, outputs: int, inputs: int) -> _Linear:
+    """The layer itself, if it has these sizes."""
+    if (layer.outputs, layer.inputs) != (outputs, inputs):
+        raise InputError(
+            f"{tensors.where}: '{layer.name}' has {layer.inputs} inputs and {layer.outputs} "
+            f"outputs, expected {inputs} and {outputs}"
+        )
+    return layer
+
+
+def _encoding(tensors: _Tensors, size: int, what: str, convention: Convention) -> FourierEncoding:
+    """Six features an octave, and three more where the vector itself is one."""
+    octaves, rest = divmod(size, 6)
+    if rest not in (0, 3):
+        raise InputError(
+            f"{tensors.where}: {size} features of a {what}, expected 6 an octave, or 3 more"
+        )
+    try:
+        return FourierEncoding(octaves, convention, include_input=rest == 3)
+    except ValueError as error:
+        raise InputError(f"{tensors.where}: {what} {error}") from error

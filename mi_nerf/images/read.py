@@ -1,0 +1,214 @@
+"""Image files to premultiplied float32 arrays.
+
+Premultiplied because that is the form in which pixels may be averaged: the mean
+of straight colours lets invisible pixels bleed into visible ones (Porter & Duff
+1984).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import OpenEXR
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..base.color import ColorSpace
+from ..base.errors import InputError
+
+IMAGE_SUFFIXES = {".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
+
+# Called as progress(done, total), always from the thread that asked for the images.
+Progress = Callable[[int, int], None]
+
+
+class ImageFile(NamedTuple):
+    """One decoded file."""
+
+    pixels: NDArray[np.float32]  # (H, W, 4), premultiplied
+    has_alpha: bool  # False: alpha is 1 throughout
+    color_space: ColorSpace
+
+
+class ImageStack(NamedTuple):
+    """The files of one split."""
+
+    pixels: NDArray[np.float32]  # (N, H/k, W/k, 4), premultiplied, k the downscale
+    has_alpha: bool  # whether any of the files has an alpha channel
+    color_space: ColorSpace
+    width: int  # of the files, before downscaling
+    height: int
+
+
+def read_images(
+    paths: Sequence[Path], downscale: int = 1, progress: Progress | None = None
+) -> ImageStack:
+    """Reads images of one size, on a small pool of threads.
+
+    Args:
+        paths: The files, at least one; formats as for :func:`read_image`.
+        downscale: As for :func:`average_blocks`.
+        progress: Called as ``progress(done, total)`` after each image.
+
+    Raises:
+        InputError: A file cannot be used, or the files differ in size or colour
+            space, or are smaller than one block.
+    """
+    first = read_image(paths[0])
+    height, width = first.pixels.shape[:2]
+    if downscale > min(height, width):
+        raise InputError(f"{paths[0]}: downscale {downscale} leaves no pixel of {width}x{height}")
+
+    # Each thread writes its own slot: no second copy of the whole stack.
+    stack = np.empty((len(paths), height // downscale, width // downscale, 4), np.float32)
+
+    def load(index: int) -> bool:
+        image = first if index == 0 else read_image(paths[index])
+        _require_same_kind(image, paths[index], first, paths[0])
+        stack[index] = average_blocks(image.pixels, downscale)
+        return image.has_alpha
+
+    has_alpha = False
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        # `map` yields in order, so the error that is reported does not depend
+        # on the timing of the threads.
+        for done, alpha in enumerate(pool.map(load, range(len(paths))), start=1):
+            has_alpha |= alpha
+            if progress is not None:
+                progress(done, len(paths))
+    return ImageStack(stack, has_alpha, first.color_space, width, height)
+
+
+def read_image(path: Path) -> ImageFile:
+    """Decodes one file.
+
+    OpenEXR holds linear, premultiplied values (half or float); every other
+    format is taken as straight sRGB, 8 or 16 bits a channel. Without an alpha
+    channel the image is opaque.
+
+    Raises:
+        InputError: The file is missing or corrupt, or is neither RGB nor RGBA.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such image")
+    if path.suffix.lower() == ".exr":
+        return _read_exr(path)
+    return _read_integers(path)
+
+
+def average_blocks(pixels: NDArray[np.float32], k: int) -> NDArray[np.float32]:
+    """Means over blocks of k×k pixels: (H, W, C) to (H//k, W//k, C).
+
+    Rows and columns that fill no block are cropped at the bottom and the right.
+    """
+    if k == 1:
+        return pixels
+    height, width, channels = pixels.shape[0] // k, pixels.shape[1] // k, pixels.shape[2]
+    blocks = pixels[: height * k, : width * k].reshape(height, k, width * k * channels)
+    # Rows first, then columns by einsum: ten times faster than mean(axis=(1, 3)).
+    columns = blocks.sum(axis=1).reshape(height, width, k, channels)
+    means: NDArray[np.float32] = np.einsum("hwkc->hwc", columns) / np.float32(k * k)
+    return means
+
+
+def _require_same_kind(image: ImageFile, path: Path, first: ImageFile, first_path: Path) -> None:
+    if image.pixels.shape != first.pixels.shape:
+        (h, w), (h0, w0) = image.pixels.shape[:2], first.pixels.shape[:2]
+        raise InputError(
+            f"images of one split must agree in size: {first_path} is {w0}x{h0}, {path} is {w}x{h}"
+        )
+    if image.color_space != first.color_space:
+        raise InputError(
+            "images of one split must agree in colour space: "
+            f"{first_path} is {first.color_space}, {path} is {image.color_space}"
+        )
+
+
+# ---- Integer formats ------------------------------------------------------
+
+
+def _read_integers(path: Path) -> ImageFile:
+    with _corruption_as_input_error(path):
+        values, mode = _decode_integers(path)
+    if mode not in ("RGB", "RGBA"):
+        channels = 1 if values.ndim == 2 else values.shape[2]
+        raise InputError(f"{path}: expected RGB or RGBA, got {channels} channel(s), {mode}")
+
+    # Straight integers over their full range to premultiplied [0, 1].
+    height, width, channels = values.shape
+    pixels = np.ones((height, width, 4), np.float32)
+    pixels[..., :channels] = values
+    pixels[..., :channels] /= np.float32(np.iinfo(values.dtype).max)
+    if channels == 4:
+        pixels[..., :3] *= pixels[..., 3:]
+    return ImageFile(pixels, channels == 4, "srgb")
+
+
+def _decode_integers(path: Path) -> tuple[NDArray[np.uint8] | NDArray[np.uint16], str]:
+    """The values as stored, (H, W) or (H, W, C), and Pillow's name for the channels."""
+    with Image.open(path) as image:
+        if image.format == "PNG" and image.tile[0][3] in ("RGB;16B", "RGBA;16B"):
+            # Pillow has no 16-bit colour images: of each value it keeps the high
+            # byte. Told that the same data is little-endian it keeps the other.
+            low = _decode_with(path, f"{image.mode};16L")
+            high = _decode_with(path, f"{image.mode};16B")
+            return high.astype(np.uint16) * 256 + low, image.mode
+        colors: Image.Image = image
+        if image.mode in ("P", "RGB") and "transparency" in image.info:
+            # A palette with alpha, or one colour that stands for "transparent".
+            colors = image.convert("RGBA")
+        elif image.mode == "P":
+            colors = image.convert("RGB")
+        colors.load()  # here, since NumPy may swallow the errors of a damaged file
+        return np.asarray(colors), colors.mode
+
+
+def _decode_with(path: Path, layout: str) -> NDArray[np.uint8]:
+    """Decodes a PNG, taking its values for Pillow's raw mode ``layout``."""
+    with Image.open(path) as image:
+        image.tile = [image.tile[0]._replace(args=layout)]
+        image.load()
+        return np.asarray(image)
+
+
+# ---- OpenEXR --------------------------------------------------------------
+
+
+def _read_exr(path: Path) -> ImageFile:
+    with _corruption_as_input_error(path):
+        # No threads of its own: the caller already has one for each core.
+        file = OpenEXR.File(str(path), separate_channels=True, num_threads=0)
+        channels, header = file.channels(), file.header()
+    if not {"R", "G", "B"} <= channels.keys():
+        found = ", ".join(sorted(channels)) or "none"
+        raise InputError(f"{path}: expected channels R, G, B and perhaps A, got {found}")
+    if not np.array_equal(header["dataWindow"], header["displayWindow"]):
+        raise InputError(f"{path}: expected a whole image, but its data window is cropped")
+
+    has_alpha = "A" in channels
+    height, width = channels["R"].pixels.shape
+    pixels = np.ones((height, width, 4), np.float32)
+    for i, name in enumerate("RGBA" if has_alpha else "RGB"):
+        pixels[..., i] = channels[name].pixels
+    broken = int(np.count_nonzero(~np.isfinite(pixels).all(axis=-1)))
+    if broken:
+        raise InputError(f"{path}: expected finite values, {broken} pixel(s) are NaN or infinite")
+    return ImageFile(pixels, has_alpha, "linear")
+
+
+@contextmanager
+def _corruption_as_input_error(path: Path) -> Iterator[None]:
+    """Decoders raise exceptions of many types for damaged files; users see one."""
+    try:
+        yield
+    except MemoryError:
+        raise
+    except Exception as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"{path}: corrupt or unreadable image ({reason})") from error

@@ -1,0 +1,175 @@
+"""A grid over the box that says where a field may hold anything at all.
+
+Samples in cells marked empty are not evaluated and count as density 0. A cell is only
+marked empty while its optical thickness, as last seen, stays below a threshold: a ray
+that crosses n such cells loses an opacity of about n · threshold at most.
+
+During training the grid also knows a density that each cell has everywhere, as far as
+seen: samples behind much of that are hidden and need no evaluation either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..base.arrays import upload, vector3_type
+from ..base.box import Corner
+from ..fields.protocol import Field
+
+# Value of a cell that was never looked at: occupied whatever the threshold.
+_UNSEEN = np.float32(np.finfo(np.float32).max)
+
+# Share of the threshold below which a cell is empty even if the whole scene is that thin.
+FAINTEST = 1e-4
+
+# The least density of a cell follows a smaller one at once, a larger one by this share a look.
+_FLOOR_RISE = 0.1
+
+
+class OccupancyGrid:
+    """Cells of an axis-aligned box, each with a decaying maximum and a floor of its density."""
+
+    def __init__(
+        self, lower: Corner, upper: Corner, cells: np.ndarray[Any, Any], float_type: Any
+    ) -> None:
+        """
+        Args:
+            lower, upper: corners of the box, in scene units.
+            cells: (X, Y, Z) booleans, true where the field may be non-empty. The other
+                cells are taken to be empty for good.
+            float_type: ``Float`` of the backend, e.g. ``mi.Float``.
+        """
+        self.lower, self.upper = lower, upper
+        self.shape = cells.shape
+        self._float, self._uint = float_type, dr.uint32_array_t(float_type)
+        self._candidates = upload(self._uint, np.flatnonzero(cells).astype(np.uint32))
+        self._values = upload(float_type, np.where(cells.ravel(), _UNSEEN, 0))
+        self._floor = dr.zeros(float_type, cells.size)
+        self._hull = self._mask = self._upload_mask(cells)
+
+    @property
+    def cell_size(self) -> np.ndarray[Any, Any]:
+        """Edge lengths of a cell, in scene units."""
+        return (np.asarray(self.upper) - np.asarray(self.lower)) / np.asarray(self.shape)
+
+    def mask(self) -> np.ndarray[Any, Any]:
+        """(X, Y, Z) booleans: the cells that are sampled."""
+        return np.array(self._mask).astype(bool).reshape(self.shape)
+
+    def values(self) -> np.ndarray[Any, Any]:
+        """(X, Y, Z) remembered densities, 1/scene unit."""
+        return np.array(self._values).reshape(self.shape)
+
+    def floor(self) -> np.ndarray[Any, Any]:
+        """(X, Y, Z) densities below which the cells have seldom been seen, 1/scene unit."""
+        return np.array(self._floor).reshape(self.shape)
+
+    def fraction(self) -> float:
+        """Share of the cells that are sampled."""
+        return float(dr.count(self._mask)[0]) / len(self._mask)
+
+    def cell(self, p: Any) -> Any:
+        """Numbers of the cells in which points (in field coordinates) lie."""
+        index = self._uint(0)
+        for i, size in enumerate(self.cell_size):
+            last = self.shape[i] - 1
+            along = dr.floor((p[i] - float(self.lower[i])) * float(1 / size))
+            index = index * self.shape[i] + self._uint(dr.fmin(dr.fmax(along, 0), float(last)))
+        return index
+
+    def occupied(self, cell: Any) -> Any:
+        """Whether cells may hold something."""
+        return dr.gather(dr.mask_t(self._float), self._mask, cell)
+
+    def least_density(self, cell: Any) -> Any:
+        """What light meets everywhere in these cells, as far as seen; 1/scene unit."""
+        return dr.gather(self._float, self._floor, cell)
+
+    def refresh(
+        self, field: Field, rng: Any, turn: int, *, queries: int, threshold: float, decay: float
+    ) -> None:
+        """Looks at the field again at one random point in each of ``queries`` cells.
+
+        Half of them take their turn among all cells that are not known to be empty for
+        good, half among those sampled now. A value decays by ``decay`` at every look and
+        never stays below the density just seen; a cell counts as empty once its value
+        times the mean edge length is below ``threshold``, or below half the mean over all
+        cells where that is less, as in a scene that is nothing but thin fog. Below
+        :data:`FAINTEST` of the threshold even such fog counts as nothing.
+
+        Args:
+            rng: a Dr.Jit generator, for the place within each cell.
+            turn: how often the grid has been refreshed before.
+        """
+        half = max(1, queries // 2)
+        sampled = self._uint(dr.compress(self._mask))
+        for pool in (self._candidates, sampled):
+            if len(pool):
+                self._look(field, pool, turn * half, half, rng, decay)
+        limit = dr.opaque(self._float, threshold / float(np.mean(self.cell_size)))
+        seen = self._hull & (self._values < float(_UNSEEN))
+        total = dr.sum(dr.select(seen, self._values, 0))
+        mean = total / dr.fmax(self._float(dr.count(seen)), 1)
+        limit = dr.fmax(dr.fmin(limit, 0.5 * mean), FAINTEST * limit)
+        kept = self._values > limit if threshold > 0 else True
+        self._mask = self._hull & kept
+        dr.eval(self._mask, self._values)
+
+    def state(self) -> dict[str, np.ndarray[Any, Any]]:
+        """All that :meth:`restore` needs, by name."""
+        return {"values": self.values(), "floor": self.floor(), "mask": self.mask()}
+
+    def restore(self, state: Mapping[str, np.ndarray[Any, Any]]) -> None:
+        """Takes up the :meth:`state` of a grid of the same shape.
+
+        Raises:
+            KeyError: if an array is missing.
+            ValueError: if the shape is another.
+        """
+        values, floor, mask = (state[name] for name in ("values", "floor", "mask"))
+        for array in (values, floor, mask):
+            if array.shape != self.shape:
+                raise ValueError(f"occupancy grid is {array.shape}, expected {self.shape}")
+        self._values = upload(self._float, np.asarray(values, np.float32).ravel())
+        self._floor = upload(self._float, np.asarray(floor, np.float32).ravel())
+        self._mask = self._upload_mask(mask)
+
+    def _upload_mask(self, cells: np.ndarray[Any, Any]) -> Any:
+        mask = upload(self._uint, cells.ravel().astype(np.uint32)) != 0
+        dr.eval(mask)
+        return mask
+
+    def _look(
+        self, field: Field, pool: Any, first: int, count: int, rng: Any, decay: float
+    ) -> None:
+        uint = self._uint
+        slot = dr.arange(uint, count)
+        new = slot < dr.opaque(uint, len(pool))  # each cell once, in however small a pool
+        cell = dr.gather(
+            uint, pool, (slot + dr.opaque(uint, first % len(pool))) % dr.opaque(uint, len(pool))
+        )
+        rest = cell
+        where: list[Any] = []
+        for size in reversed(self.shape):
+            where.insert(0, rest % size)
+            rest = rest // size
+        p = vector3_type(self._float)(
+            *(
+                (self._float(w) + rng.random(self._float, count)) * float(s) + float(low)
+                for w, s, low in zip(where, self.cell_size, self.lower, strict=True)
+            )
+        )
+        dr.eval(p, cell)
+        with dr.suspend_grad():
+            density = field.density(p)
+            old = dr.gather(self._float, self._values, cell)
+            old = dr.select(old < float(_UNSEEN), old * decay, 0)
+            floor = dr.gather(self._float, self._floor, cell)
+            risen = floor + _FLOOR_RISE * (density - floor)
+            dr.scatter(self._values, dr.fmax(old, density), cell, new)
+            dr.scatter(self._floor, dr.fmin(risen, density), cell, new)
+            dr.eval(self._values, self._floor)

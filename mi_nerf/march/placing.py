@@ -1,0 +1,109 @@
+"""Places samples along rays: stratified, culled by occupancy, refined by a coarse network."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+
+from ..fields.protocol import Field
+from .importance import inverse_transform, merge_sorted
+from .intervals import ray_segments
+from .occupancy import OccupancyGrid
+from .quadrature import sample_weights
+from .query import (
+    Evaluation,
+)
+from .samples import Samples
+from .settings import MarchSettings
+from .strata import cell_widths, points_along, stratified
+
+
+def place_samples(
+    field: Field,
+    o: Any,
+    d: Any,
+    settings: MarchSettings,
+    *,
+    occupancy: OccupancyGrid | None = None,
+    jitter: Any = None,
+    bounds: tuple[Any, Any] | None = None,
+) -> Samples:
+    """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
+
+    ``jitter`` is passed on to :func:`mi_nerf.march.strata`; ``bounds`` limits t
+    ray by ray, besides what ``settings`` say. Sample positions carry no gradient. In
+    normalised device coordinates samples are evenly spread in t' (NeRF, appendix C).
+    """
+    with dr.suspend_grad():
+        within = ray_segments(field, o, d, (settings.near, settings.far), bounds or (None, None))
+        o, d, near, far = within.o, within.d, within.near, within.far
+        t, delta = stratified(near, far, settings.samples, jitter)
+        even = settings.rule == "constant"
+        if not even:
+            delta = cell_widths(t, near, far, settings.samples)
+        count, rule, ndc = settings.samples, settings.rule, within.ndc
+        samples = Samples(
+            o, d, within.view, t, delta, count, near, far, ndc=ndc, rule=rule, even=even
+        )
+        samples = _select(samples, within.hit, occupancy, settings.hidden)
+        coarse = getattr(field, "coarse", None)
+        if coarse is None or not settings.fine:
+            return samples
+        evaluation = Evaluation(coarse, samples, settings.block, stop=settings.stop)
+        weights, _ = sample_weights(evaluation.density, delta, settings.samples)
+        shift = jitter if jitter is not None and len(jitter) == samples.rays else None
+        samples.index = evaluation.asked
+        return refine(samples, weights, settings.fine, occupancy, shift)
+
+
+def refine(
+    samples: Samples,
+    weights: Any,
+    fine: int,
+    occupancy: OccupancyGrid | None = None,
+    jitter: Any = None,
+    hidden: float = 0.0,
+) -> Samples:
+    """Adds ``fine`` samples a ray where ``weights`` are large (NeRF Sec. 5.2).
+
+    Args:
+        samples: the coarse samples, one in each of equal strata.
+        weights: theirs; without gradient.
+        jitter: R·F numbers in [0, 1), or R to shift all of a ray alike; ``None`` for the
+            middle of the strata of the cumulative distribution.
+        hidden: as in :class:`MarchSettings`.
+    """
+    with dr.suspend_grad():
+        near, far, count = samples.near, samples.far, samples.count
+        more = inverse_transform(near, far, dr.detach(weights), count, fine, jitter)
+        t = merge_sorted(samples.t, more, count, fine)
+        delta = cell_widths(t, near, far, count + fine)
+        merged = replace(
+            samples,
+            t=t,
+            delta=delta,
+            count=count + fine,
+            coarse_queries=samples.queries,
+            even=False,
+        )
+        return _select(merged, far > near, occupancy, hidden)
+
+
+def _select(samples: Samples, hit: Any, occupancy: OccupancyGrid | None, hidden: float) -> Samples:
+    """Keeps for evaluation the samples that may lie in something, and may be seen."""
+    dr.eval(samples.t, samples.delta, samples.near, samples.far)
+    t = samples.t
+    uint = dr.uint32_array_t(type(t))
+    ray = dr.arange(uint, len(t)) // samples.count
+    wanted = dr.gather(dr.mask_t(type(t)), hit, ray)
+    if occupancy is not None:
+        cell = occupancy.cell(points_along(samples.o, samples.d, t, ray))
+        wanted &= occupancy.occupied(cell)
+        if hidden > 0:
+            tau = dr.select(wanted, occupancy.least_density(cell) * samples.delta, 0)
+            before = dr.block_prefix_sum(tau, samples.count, exclusive=True)
+            wanted &= before < dr.opaque(type(t), hidden)
+    samples.index = uint(dr.compress(wanted))
+    return samples

@@ -1,0 +1,110 @@
+"""Renders rays through a field: the one path that training, evaluation and plugins share.
+
+    rays → (normalised device coordinates) → interval in the box → strata
+         → (cells that may hold something) → (where the coarse network sees something)
+         → field, in blocks of constant size, front to back → quadrature
+
+The field sees its queries in blocks of a constant number of columns, so tensor-mode
+kernels are compiled once whatever the number of samples a ray batch needs. The
+quadrature works on all samples at once. Its adjoint reaches the field block by
+block, which is what bounds the memory of a gradient.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+
+from ..base.arrays import gather_vector3
+from ..fields.protocol import Field
+from .occupancy import OccupancyGrid
+from .placing import place_samples
+from .quadrature import Composite, composite
+from .query import (
+    Evaluation,
+)
+from .samples import Samples
+from .settings import MarchSettings
+
+
+def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
+    """Quadrature of an evaluated batch; differentiable in density and emission.
+
+    Depth is a distance in scene space: in normalised device coordinates, that of the
+    mean t'.
+    """
+    ends = (samples.near, samples.far) if samples.rule == "linear" else None
+    seen = composite(
+        evaluation.density, evaluation.emission, samples.t, samples.delta, samples.count, ends
+    )
+    if samples.ndc is None:
+        return seen
+    distance = samples.ndc.to_distance(seen.depth)
+    return replace(seen, depth=dr.select(seen.opacity > 0, distance, 0))
+
+
+@dataclass
+class RayImage:
+    """What R rays see, without background, in the field's colour space."""
+
+    color: list[Any]  # three arrays of R values, premultiplied by the opacity
+    opacity: Any
+    depth: Any  # distance along the unit ray, scene units; 0 where nothing is seen
+    queries: int  # how often its networks were asked
+
+
+def ray_chunks(rays: int, settings: MarchSettings) -> Iterator[tuple[int, int]]:
+    """Splits R rays into ranges whose samples fit in ``settings.chunk``."""
+    size = max(1, settings.chunk // (settings.samples + settings.fine))
+    for start in range(0, rays, size):
+        yield start, min(size, rays - start)
+
+
+def render_rays(
+    field: Field,
+    o: Any,
+    d: Any,
+    settings: MarchSettings,
+    *,
+    occupancy: OccupancyGrid | None = None,
+    jitter: Any = None,
+) -> RayImage:
+    """Renders R rays without derivatives, in chunks of bounded memory.
+
+    Args:
+        o, d: origins and unit directions, in the field's coordinates.
+        jitter: R numbers in [0, 1) that shift the samples of each ray within their
+            strata; ``None`` for the middle of each stratum.
+    """
+    float_type = type(o[0])
+    rays = max(len(o[0]), len(d[0]))
+    outputs = [dr.zeros(float_type, rays) for _ in range(5)]
+    queries = 0
+    with dr.suspend_grad():
+        for start, size in ray_chunks(rays, settings):
+            index, chunk_o, chunk_d, offset = slice_rays(o, d, jitter, start, size)
+            samples = place_samples(
+                field, chunk_o, chunk_d, settings, occupancy=occupancy, jitter=offset
+            )
+            evaluation = Evaluation(field, samples, settings.block, stop=settings.stop)
+            result = integrate(evaluation, samples)
+            values = [*result.color, result.opacity, result.depth]
+            for output, value in zip(outputs, values, strict=True):
+                dr.scatter(output, value, index)
+            dr.eval(outputs)
+            queries += len(evaluation.asked) + samples.coarse_queries
+    return RayImage(outputs[:3], outputs[3], outputs[4], queries)
+
+
+def slice_rays(o: Any, d: Any, jitter: Any, start: int, size: int) -> tuple[Any, Any, Any, Any]:
+    """Rays ``start … start + size`` of a batch, with their indices and jitter."""
+    float_type = type(o[0])
+    uint = dr.uint32_array_t(float_type)
+    index = dr.arange(uint, size) + dr.opaque(uint, start)
+    part_o, part_d = gather_vector3(o, index), gather_vector3(d, index)
+    offset = None if jitter is None else dr.gather(float_type, jitter, index)
+    dr.eval(index, part_o, part_d, offset)
+    return index, part_o, part_d, offset

@@ -1,0 +1,63 @@
+"""Samples along rays, and which of them a field has to be asked about."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+
+from ..cameras.ndc import NdcRays
+from .quadrature import Rule
+from .strata import cell_edges, stratum_edges
+
+
+@dataclass
+class Samples:
+    """R·S samples of R rays, and which of them the field has to be asked about."""
+
+    o: Any  # R origins, in the space where the field lives
+    d: Any  # R unit directions in that space
+    view: Any  # R unit directions in scene space, along which the field emits
+    t: Any  # R·S sample parameters
+    delta: Any  # R·S interval lengths
+    count: int  # S
+    near: Any  # R bounds of t
+    far: Any
+    index: Any = None  # the M samples to evaluate, ascending
+    coarse_queries: int = 0  # of the coarse network, by which the samples were placed
+    ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
+    rule: Rule = "constant"
+    even: bool = True  # whether the intervals are equal strata of the ray
+
+    @property
+    def rays(self) -> int:
+        """R."""
+        return len(self.t) // self.count
+
+    @property
+    def queries(self) -> int:
+        """M."""
+        return len(self.index)
+
+    def edges(self) -> Any:
+        """R·(S + 1) ascending ends of the intervals: sample s lies between s and s + 1."""
+        if self.even:
+            return stratum_edges(self.near, self.far, self.count)
+        return cell_edges(self.t, self.near, self.far, self.count)
+
+    def truncate(self, budget: int) -> Any:
+        """Keeps the first ``budget`` queries; returns how many rays keep all of theirs.
+
+        Rays from that number on are incomplete and must be left out of a loss. The number
+        is an array of one element, which the host need not wait for.
+        """
+        uint, queries = type(self.index), self.queries
+        if not queries:
+            return dr.opaque(uint, self.rays)
+        after = dr.opaque(uint, budget)
+        lost = after < dr.opaque(uint, queries)  # the same kernels, whether or not there are any
+        first_lost = dr.gather(uint, self.index, after, lost)
+        kept = dr.arange(uint, min(queries, budget)) + dr.opaque(uint, 0)
+        self.index = dr.gather(uint, self.index, kept)
+        return dr.select(lost, first_lost // self.count, dr.opaque(uint, self.rays))

@@ -1,0 +1,98 @@
+"""Pictures of a field from pinhole cameras, as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..base.arrays import vector3_type
+from ..base.color import linear_to_srgb
+from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
+from ..fields.protocol import Field
+from .occupancy import OccupancyGrid
+from .render import render_rays
+from .settings import MarchSettings
+
+Image = np.ndarray[Any, Any]
+
+
+@dataclass(frozen=True)
+class View:
+    """What a camera sees of a field, without background."""
+
+    color: Image  # (H, W, 3) in the field's colour space, premultiplied
+    opacity: Image  # (H, W)
+    depth: Image  # (H, W) distance along the ray, scene units; 0 where nothing is seen
+    queries: int  # how often the field was asked
+
+    def over(self, background: float) -> Image:
+        """(H, W, 3) in front of a grey value of the field's colour space."""
+        return self.color + (1 - self.opacity[..., None]) * background
+
+
+def render_view(
+    field: Field,
+    intrinsics: Intrinsics,
+    cam_to_world: ArrayLike,
+    march: MarchSettings,
+    backend: Any,
+    *,
+    occupancy: OccupancyGrid | None = None,
+    spp: int = 1,
+) -> View:
+    """Renders one view through pixel centres, or a regular grid of ``spp`` points a pixel.
+
+    Args:
+        cam_to_world: (4, 4), OpenGL axes.
+        backend: ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+        spp: rays a pixel, rounded down to a square number.
+    """
+    side = max(1, int(np.sqrt(spp)))
+    total: list[Image] = []
+    queries = 0
+    for i in range(side * side):
+        offset = ((i % side + 0.5) / side, (i // side + 0.5) / side)
+        o, d = _rays(intrinsics, cam_to_world, backend, offset)
+        seen = render_rays(field, o, d, march, occupancy=occupancy)
+        planes = np.stack([np.array(v) for v in (*seen.color, seen.opacity, seen.depth)])
+        total.append(planes)
+        queries += seen.queries
+    shape = (intrinsics.height, intrinsics.width)
+    planes = np.mean([t[:4] for t in total], axis=0).reshape(4, *shape)
+    color = np.moveaxis(planes[:3], 0, -1)
+    return View(color, planes[3], _mean_depth(total).reshape(shape), queries)
+
+
+def display_image(view: View, color_space: str, background: float = 1.0) -> Image:
+    """(H, W, 3) sRGB values over a background, for looking at."""
+    image = view.over(background)
+    return linear_to_srgb(image) if color_space == "linear" else image
+
+
+def _rays(
+    intrinsics: Intrinsics, cam_to_world: ArrayLike, backend: Any, offset: tuple[float, float]
+) -> tuple[Any, Any]:
+    float_type, uint = backend.Float, backend.UInt32
+    width = dr.opaque(uint, intrinsics.width)
+    index = dr.arange(uint, intrinsics.width * intrinsics.height)
+    row = index // width
+    x = float_type(index - row * width) + dr.opaque(float_type, offset[0])
+    y = float_type(row) + dr.opaque(float_type, offset[1])
+    poses = float_type(pack_poses(np.asarray(cam_to_world)[None]))
+    o, d = pixel_rays(poses, intrinsics, uint(0), x, y)
+    # One origin for all rays: repeated, because chunks of rays are gathered from it.
+    o = vector3_type(float_type)(*(o[i] + dr.zeros(float_type, len(index)) for i in range(3)))
+    dr.eval(o, d)
+    return o, d
+
+
+def _mean_depth(total: list[Image]) -> Image:
+    """Mean of the depths, weighted by opacity: empty rays do not count."""
+    opacity = np.stack([t[3] for t in total])
+    depth = np.stack([t[4] for t in total])
+    weight = opacity.sum(axis=0)
+    return np.where(weight > 0, (opacity * depth).sum(axis=0) / np.maximum(weight, 1e-30), 0)

@@ -1,0 +1,253 @@
+"""The ``nerf`` integrator: radiance fields among surfaces, by quadrature along camera rays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..base.errors import InputError
+from .backdrop import Backdrop, Environment, SolidScene, Surfaces, check_nested, has_surfaces
+from .film import FieldIntegrator
+from .marching import MarchingIntegrator, traced
+from .placement import find_fields
+from .stage import Stage
+
+
+class NerfIntegrator(MarchingIntegrator):
+    r"""
+    .. _integrator-nerf:
+
+    Neural radiance field (:monosp:`nerf`)
+    --------------------------------------
+
+    .. pluginparameters::
+
+     * - (Nested plugin)
+       - |integrator|
+       - What shows surfaces and lights, such as :monosp:`path` or :monosp:`prb`: any integrator
+         that returns the radiance along a ray. Without one, the scene's surfaces are left out,
+         and only its environment emitter is seen. (Default: none)
+     * - paths
+       - |int|
+       - How often the nested integrator is asked about each camera ray. A ray through a field
+         costs many times as much as a path: with 4 samples a pixel and ``paths`` 16, surfaces
+         get 64 paths a pixel for the price of 4 rays through the fields. (Default: 1)
+     * - samples
+       - |int|
+       - Strata along each ray between entry and exit of a field's box.
+         (Default: what the field file suggests)
+     * - near, far
+       - |float|
+       - Fixed bounds of the distance along the ray, in world units, within the boxes.
+         (Default: what the field file suggests)
+     * - rule
+       - |string|
+       - How density runs between samples: ``constant`` over strata, over ``cells`` that
+         reach halfway to the next sample, or ``linear`` from sample to sample, which counts
+         as ``cells`` where a scene holds several fields.
+         (Default: what the field file suggests)
+     * - stop
+       - |float|
+       - A ray ends where a field lets pass less than this share of the light behind, which
+         changes the opacity by less than it, and a colour by less than it times the largest
+         radiance. Derivatives always take all samples. 0 switches it off.
+         (Default: what the field file suggests, 1e-3 as trained)
+     * - jitter
+       - |bool|
+       - Shift the samples of every camera ray at random within their strata. Without
+         it, all randomness comes from the film position. (Default: true)
+     * - aovs
+       - |string|
+       - Extra channels, a comma-separated list of the following, each perhaps with a channel
+         name in front as in ``z:depth``. (Default: none)
+
+         - ``depth``: mean distance along the ray of fields and the first surface, weighted by
+           what each contributes; 0 where nothing is seen.
+         - ``opacity``: that of the fields before the first surface.
+         - ``normal``: mean of the unit normals −∇σ/|∇σ| of fields, in world coordinates, and
+           the shading normal of the first surface, weighted likewise; three channels. It
+           carries no derivatives.
+         - ``index``: number of the field that contributes most, counted from 1 in the
+           alphabetical order of the ids of the cubes; 0 where no field is seen. Averaged like
+           everything else over the samples of a pixel, without derivatives.
+     * - hide_emitters
+       - |bool|
+       - Leave out the environment emitter behind the fields. A nested integrator has an option
+         of its own for that. (Default: false)
+     * - encoded
+       - |bool|
+       - Leave the colour of a field trained on sRGB images as it was composited, in sRGB,
+         with the environment encoded likewise; for a single field without a nested
+         integrator. (Default: false)
+
+    Estimates the volume-rendering integral (NeRF, Eq. 3) of all ``nerfmedium`` of the scene.
+    Where several overlap, densities add up and the emission is the mean by density,
+    c = Σ σ_k c_k / Σ σ_k: the samples of all fields along a ray are merged in depth and
+    integrated once (:py:mod:`mi_nerf.march.merging`). The integral ends exactly at the first
+    surface, and the nested integrator's radiance of the ray, weakened by the fields before it,
+    is added. The nested integrator does not know the fields: it sees the scene without their
+    cubes, so fields cast no shadows and are missing in mirrors; :monosp:`nerf_path` has both. What
+    is seen through a surface that is not opaque is likewise without fields.
+
+    The alpha channel of an RGBA film is the opacity of the fields; with a nested integrator,
+    its alpha channel with the fields in front. The colour of a field trained on sRGB images is
+    composited as in training and then decoded: with C the colour under the field's weights and
+    A their sum, the linear radiance is A·srgb_to_linear(C/A). Other fields and surfaces are
+    mixed with that in linear radiance: each field on its own looks just as it does alone, and
+    where it is partly transparent, as at its edges, it is blended with what lies behind it as
+    light is, not as the numbers of an sRGB image are. Compositing the same field in sRGB over a
+    bright background, as training on white does, gives darker edges.
+
+    Images are differentiable with respect to the weights of the fields and their places (the
+    medium's ``to_world``, the vertices of its cube), and to whatever the nested integrator
+    differentiates, such as colours of surfaces and lights; not with respect to where surfaces
+    or the camera are. Mitsuba's C++ integrators are differentiated by recording their paths,
+    which takes memory for every bounce; :monosp:`prb` spares that.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="nerf">
+                <string name="aovs" value="depth,opacity"/>
+                <integrator type="path"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'nerf',
+            'aovs': 'depth,opacity',
+            'nested': {'type': 'path'}
+    """
+
+    plugin = "nerf"
+
+    def __init__(self, props: mi.Properties) -> None:
+        super().__init__(props)
+        self.encoded = bool(props.get("encoded", False))
+        self.nested = self._find_nested(props)
+        self._solid, self._warned = SolidScene(), False
+
+    @staticmethod
+    def _find_nested(props: mi.Properties) -> Any:
+        """The integrator among the properties, or ``None``."""
+        found = [(key, props[key]) for key in props.unqueried()]
+        found = [(key, value) for key, value in found if isinstance(value, mi.Integrator)]
+        if len(found) > 1:
+            raise InputError(f"nerf: {len(found)} nested integrators, expected at most one")
+        for _, nested in found:
+            if isinstance(nested, FieldIntegrator):
+                raise InputError(
+                    f"nerf: '{nested.plugin}' nested in 'nerf', expected one like 'path' or 'prb'"
+                )
+            check_nested(nested)
+            return nested
+        return None
+
+    def traverse(self, callback: Any) -> None:
+        """Exposes the nested integrator."""
+        if self.nested is not None:
+            callback.put("nested", self.nested, mi.ParamFlags.Differentiable)
+
+    def to_string(self) -> str:
+        """Lists the settings."""
+        return (
+            "NerfIntegrator[\n"
+            f"{self._settings()}"
+            f"  encoded = {self.encoded},\n"
+            f"  nested = {self.nested}\n"
+            "]"
+        )
+
+    # ---------------------------------- Derivatives ----------------------------------
+
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        grad_in: Any,
+        sensor: int | mi.Sensor = 0,
+        seed: Any = 0,
+        spp: int = 0,
+    ) -> None:
+        """Carries the gradient of an image to the parameters of fields, surfaces and lights.
+
+        First to the values of the camera rays, through reconstruction filter and film,
+        then chunk by chunk through quadrature and network: memory does not grow with
+        the image.
+        """
+        sensor = self._sensor(scene, sensor)
+        with dr.suspend_grad():
+            stage = self._stage(scene)
+            waves = list(traced(stage, self._waves(scene, sensor, seed, spp)))
+            with dr.resume_grad():
+                for wave in waves:
+                    dr.enable_grad(wave.outputs)
+                image = self._develop(sensor.film(), waves, True)
+                dr.set_grad(image, grad_in)
+                dr.enqueue(dr.ADMode.Backward, image)
+                dr.traverse(dr.ADMode.Backward)
+                adjoints = [[dr.grad(output) for output in wave.outputs] for wave in waves]
+            dr.eval(adjoints)
+            for wave, gradients in zip(waves, adjoints, strict=True):
+                dr.disable_grad(wave.outputs)
+                stage.backward(wave, gradients)
+
+    def render_forward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        sensor: int | mi.Sensor = 0,
+        seed: Any = 0,
+        spp: int = 0,
+    ) -> Any:
+        """The derivative of an image along the gradients of the scene's parameters."""
+        sensor = self._sensor(scene, sensor)
+        with dr.suspend_grad():
+            stage = self._stage(scene)
+            waves = list(traced(stage, self._waves(scene, sensor, seed, spp)))
+            for wave in waves:
+                tangents = stage.forward(wave)
+                with dr.resume_grad():
+                    for output, tangent in zip(wave.outputs, tangents, strict=True):
+                        dr.enable_grad(output)
+                        dr.set_grad(output, tangent)
+            with dr.resume_grad():
+                image = self._develop(sensor.film(), waves, True)
+                dr.forward_to(image)
+                return dr.grad(image)
+
+    # ---------------------------------- Scene ----------------------------------
+
+    def _stage(self, scene: mi.Scene) -> Stage:
+        """The scene as it is now."""
+        found = find_fields(scene)
+        encoded = self.encoded and found[0].medium.field.color_space == "srgb"
+        if self.encoded and (len(found) > 1 or self.nested is not None):
+            raise InputError(
+                "nerf: encoded=true with several fields or a nested integrator, expected a "
+                "single field: light mixes in linear radiance"
+            )
+        fields = self._marched(found, encoded)
+        normals = self._wants_normals(fields)
+        backdrop: Backdrop
+        if self.nested is None:
+            self._warn_of_surfaces(scene)
+            backdrop = Environment(scene, self.show_background, encoded)
+        else:
+            backdrop = Surfaces(self._solid.of(scene), self.nested, self.paths, normals)
+        return Stage(fields, backdrop, normals)
+
+    def _warn_of_surfaces(self, scene: mi.Scene) -> None:
+        if not self._warned and has_surfaces(scene):
+            mi.Log(
+                mi.LogLevel.Warn,
+                "nerf: the scene's surfaces and lights are left out without an integrator to "
+                'show them: nest one, as in <integrator type="nerf"><integrator type="path"/>'
+                "</integrator>",
+            )
+        self._warned = True
+
+
+mi.register_integrator("nerf", NerfIntegrator)

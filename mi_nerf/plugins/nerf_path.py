@@ -1,0 +1,165 @@
+"""The ``nerf_path`` integrator: light transport among surfaces and radiance fields."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from ..base.errors import InputError
+from .backdrop import SolidScene, check_no_loose_field
+from .marching import MarchingIntegrator
+from .path_state import PathSettings
+from .paths import PathsBehind
+from .placement import find_fields
+from .stage import Stage
+
+
+class NerfPathIntegrator(MarchingIntegrator):
+    r"""
+    .. _integrator-nerf_path:
+
+    Path tracer through radiance fields (:monosp:`nerf_path`)
+    ---------------------------------------------------------
+
+    .. pluginparameters::
+
+     * - max_depth
+       - |int|
+       - Segments of the longest path, as in :monosp:`path`: 1 shows only what emits, fields
+         included; 2 adds what surfaces reflect of that; −1 sets no limit. Fields add nothing
+         to the depth. (Default: −1)
+     * - rr_depth
+       - |int|
+       - Surfaces on a path from which on it may end at random, with a probability that follows
+         from its throughput (Russian roulette). (Default: 5)
+     * - hide_emitters
+       - |bool|
+       - Hide lights and environment from cameras; fields are seen. (Default: false)
+     * - sample_fields
+       - |bool|
+       - At matt and glossy surfaces, sample directions towards the fields besides those that
+         the surface prefers and those of the scene's lights. Worth its time where fields are
+         the lamps; among other lights a path costs several times as much and is hardly less
+         noisy. The mean is the same. (Default: false)
+     * - paths
+       - |int|
+       - Paths that go on behind the fields for every camera ray. (Default: 1)
+     * - samples
+       - |int|
+       - Strata along each segment between entry and exit of a field's box.
+         (Default: what the field file suggests)
+     * - near, far
+       - |float|
+       - Fixed bounds of the distance along camera rays, in world units, within the boxes. Neither
+         these nor those of a field file bound other segments.
+         (Default: what the field file suggests)
+     * - rule
+       - |string|
+       - How density runs between samples, as in :monosp:`nerf`.
+         (Default: what the field file suggests)
+     * - stop
+       - |float|
+       - Paths end where fields let less than this share of them pass. 0 switches it off.
+         (Default: what the field file suggests, 1e-3 as trained)
+     * - jitter
+       - |bool|
+       - Shift the samples of every segment at random within their strata. (Default: true)
+     * - aovs
+       - |string|
+       - Extra channels of camera rays: ``depth``, ``opacity``, ``normal``, ``index``, as in
+         :monosp:`nerf`. (Default: none)
+
+    Follows light paths among surfaces and lights, each segment of which passes the fields: they
+    weaken it and add what they emit. So fields cast shadows, are seen in mirrors and through
+    glass, and light up what stands around them; they do not scatter, so nothing lights *them*
+    up: what they show is what they were trained to show. The cubes of fields are no surfaces.
+    A scene without fields looks as :monosp:`path` shows it.
+
+    Light sources are sampled as in :monosp:`path`, and the light that arrives is weakened by the
+    fields between; only their densities are asked for that. Light from fields is found by the
+    directions that the surface's BSDF prefers and, with ``sample_fields``, also by directions
+    towards points spread evenly in the box around the occupied cells of a field
+    (:py:mod:`mi_nerf.plugins.field_light`), combined by multiple importance sampling (Veach and
+    Guibas 1995). Fields in normalised device coordinates have no such box: only the first of
+    these finds them.
+
+    The estimate is without bias apart from the quadrature along each segment, which is that of
+    :monosp:`nerf`. All light is linear: on every segment, a field trained on sRGB images is
+    composited in sRGB as it was in training and then decoded. With C its colour and A its opacity
+    there, it adds A·srgb_to_linear(C/A) and lets pass 1 − A, so it looks in a mirror, or on the
+    floor below, as it does to the camera. Where fields are partly transparent, what they add is
+    not additive along the ray: a surface within such a field splits it, and both parts decoded
+    on their own differ a little from the whole decoded at once.
+
+    There are no derivatives; :monosp:`nerf` has them.
+
+    .. tabs::
+        .. code-tab:: xml
+
+            <integrator type="nerf_path">
+                <integer name="max_depth" value="8"/>
+            </integrator>
+
+        .. code-tab:: python
+
+            'type': 'nerf_path',
+            'max_depth': 8
+    """
+
+    plugin = "nerf_path"
+    rays_per_pass = 1 << 20  # paths remember more than rays do
+
+    def __init__(self, props: mi.Properties) -> None:
+        # Checked before the base class reads and refuses them.
+        self._integer(props, "max_depth", -1, least=0)
+        self._integer(props, "rr_depth", 5, least=1)
+        super().__init__(props)
+        if props.get("max_depth", -1) < 0:  # the base class has a default of its own
+            self.max_depth = _UNLIMITED
+        self.sample_fields = bool(props.get("sample_fields", False))
+        self._solid = SolidScene()
+
+    def to_string(self) -> str:
+        """Lists the settings."""
+        depth = "unlimited" if self.max_depth == _UNLIMITED else self.max_depth
+        return (
+            "NerfPathIntegrator[\n"
+            f"  max_depth = {depth}, rr_depth = {self.rr_depth},\n"
+            f"{self._settings()}"
+            f"  sample_fields = {self.sample_fields}\n"
+            "]"
+        )
+
+    def render_backward(self, *args: Any, **kwargs: Any) -> None:
+        """Refused: there are no derivatives."""
+        raise InputError(_NO_DERIVATIVES)
+
+    def render_forward(self, *args: Any, **kwargs: Any) -> Any:
+        """Refused: there are no derivatives."""
+        raise InputError(_NO_DERIVATIVES)
+
+    def _stage(self, scene: mi.Scene) -> Stage:
+        """The scene as it is now."""
+        found = find_fields(scene, least=0)
+        if not found:
+            check_no_loose_field(scene)
+        fields = self._marched(found) if self.max_depth > 0 else []
+        normals = self._wants_normals(fields)
+        settings = PathSettings(
+            max_depth=self.max_depth,
+            rr_depth=self.rr_depth,
+            paths=self.paths,
+            hide_lights=not self.show_background,
+            sample_fields=self.sample_fields,
+            jitter=self.jitter,
+            stop=min((field.march.stop for field in fields), default=0.0),
+        )
+        solid = self._solid.of(scene)
+        return Stage(fields, PathsBehind(solid, fields, settings, normals), normals)
+
+
+_UNLIMITED = 2**31 - 1
+_NO_DERIVATIVES = "nerf_path: has no derivatives, expected the integrator 'nerf' for them"
+
+mi.register_integrator("nerf_path", NerfPathIntegrator)

@@ -1,0 +1,1 @@
+"""Mitsuba scenes as files: loading, instances, the scenes that come along."""

@@ -1,0 +1,235 @@
+"""The ablations of the paper (NeRF, Table 2) on one dataset: runs, table, figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import InputError
+from ..base.files import make_folder, replacing, write_json
+from ..fields.fourier import FourierEncoding
+from ..training.config import TrainConfig, to_json
+from ..training.run import Run
+from .evaluate import evaluate
+from .series import check_same, mean, trained
+from .target import open_target
+
+RECORD, TABLE, FIGURE = "ablation.json", "ablation.md", "ablation.png"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table: what is changed of the complete model."""
+
+    name: str
+    title: str
+    change: Callable[[TrainConfig], TrainConfig]
+
+
+def complete(config: TrainConfig) -> TrainConfig:
+    """The paper's whole model at the scale of ``config``: L = 10 and 4, two networks.
+
+    What spares queries in a way that the paper does not know is switched off, so that the
+    rows differ in what they are named after alone.
+    """
+    sampling = config.sampling
+    if not sampling.fine:
+        sampling = replace(sampling, samples=32, fine=32, render_samples=32)
+    return replace(
+        config,
+        position=FourierEncoding(frequencies=10),
+        direction=FourierEncoding(frequencies=4),
+        occupancy=replace(config.occupancy, enabled=False),
+        sampling=replace(sampling, hidden=0.0, render_stop=0.0),
+    )
+
+
+def _no_encoding(config: TrainConfig) -> TrainConfig:
+    plain = FourierEncoding(frequencies=0)
+    return replace(config, position=plain, direction=plain)
+
+
+def _no_view_dependence(config: TrainConfig) -> TrainConfig:
+    return replace(config, network=replace(config.network, view_dependent=False))
+
+
+def _no_hierarchy(config: TrainConfig) -> TrainConfig:
+    """One network, and as many samples as both had queries (64 + 192 = 256 in the paper)."""
+    old = config.sampling
+    samples = 2 * old.samples + old.fine
+    sampling = replace(
+        old,
+        samples=samples,
+        fine=0,
+        render_samples=samples,
+        render_fine=None,
+        batch=max(old.batch, samples),
+    )
+    return replace(config, sampling=sampling)
+
+
+def _octaves(count: int) -> Callable[[TrainConfig], TrainConfig]:
+    return lambda config: replace(config, position=FourierEncoding(frequencies=count))
+
+
+def _views(count: int) -> Callable[[TrainConfig], TrainConfig]:
+    return lambda config: replace(config, views=count)
+
+
+ROWS = {
+    row.name: row
+    for row in (
+        Row(
+            "no-pe-vd-h",
+            "No PE, VD, H",
+            lambda c: _no_hierarchy(_no_view_dependence(_no_encoding(c))),
+        ),
+        Row("no-pe", "No positional encoding", _no_encoding),
+        Row("no-vd", "No view dependence", _no_view_dependence),
+        Row("no-h", "No hierarchical sampling", _no_hierarchy),
+        Row("25-images", "Far fewer images (25)", _views(25)),
+        Row("50-images", "Fewer images (50)", _views(50)),
+        Row("l5", "Fewer frequencies (L = 5)", _octaves(5)),
+        Row("l15", "More frequencies (L = 15)", _octaves(15)),
+        Row("complete", "Complete model", lambda c: c),
+    )
+}
+
+
+def ablate(
+    data: str | Path,
+    out: str | Path,
+    config: TrainConfig,
+    variant: str,
+    *,
+    rows: Sequence[str] = tuple(ROWS),
+    seeds: int = 1,
+    split: str = "test",
+    views: int | None = None,
+) -> dict[str, Any]:
+    """Trains and evaluates every row with every seed; goes on where it was interrupted.
+
+    Args:
+        config: scale and budget of all rows; :func:`complete` makes the last row of it.
+        split, views: what the rows are evaluated on.
+
+    Returns:
+        What ``ablation.json`` holds; its ``complete`` is false after Ctrl-C.
+
+    Raises:
+        InputError: if a row is unknown, or the folder holds another ablation.
+    """
+    for name in rows:
+        if name not in ROWS:
+            raise InputError(f"row '{name}': unknown, expected one of {', '.join(ROWS)}")
+    if config.preset == "auto":
+        raise InputError("preset 'auto': decides what rows differ in, expected nerf, fast or paper")
+    folder = Path(out)
+    base = complete(config)
+    settings: dict[str, Any] = {"data": str(Path(data).resolve()), "split": split, "views": views}
+    settings["base"] = to_json(base)
+    record = {"settings": settings, "complete": False, "rows": []}
+    check_same(folder, RECORD, settings, "an ablation")
+    make_folder(folder)
+    write_json(folder / RECORD, record)
+    results: dict[str, list[dict[str, Any]]] = {name: [] for name in rows}
+    for seed in range(seeds):  # whole tables first: an early end leaves something to compare
+        for name in rows:
+            wanted = replace(ROWS[name].change(base), seed=base.seed + seed)
+            print(f"{name}, seed {wanted.seed}", flush=True)
+            place = folder / name / f"seed_{wanted.seed}"
+            measure = partial(_quality, settings=settings, variant=variant)
+            result = trained(data, place, wanted, variant, measure)
+            if result is None:
+                return _write(folder, record, results)
+            results[name].append(result)
+    record["complete"] = True
+    return _write(folder, record, results)
+
+
+def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]:
+    """What the table says of a finished run."""
+    target = open_target(run.folder)
+    found = evaluate(target, variant, split=settings["split"], views=settings["views"])
+    names = ("queries_per_ray", "parameters", "views", "size")
+    return {**found["mean"], "train_seconds": run.seconds, **{n: found[n] for n in names}}
+
+
+# ---- Table and figure --------------------------------------------------------
+
+
+def _write(
+    folder: Path, record: dict[str, Any], results: dict[str, list[dict[str, Any]]]
+) -> dict[str, Any]:
+    record["rows"] = [
+        {"name": name, "title": ROWS[name].title, **_summary(runs), "runs": runs}
+        for name, runs in results.items()
+        if runs
+    ]
+    write_json(folder / RECORD, record)
+    with replacing(folder / TABLE) as temporary:
+        temporary.write_text(table(record))
+    if any(row["psnr"] is not None for row in record["rows"]):
+        _draw(folder / FIGURE, record)
+    return record
+
+
+def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """Means over the runs that did not fail."""
+    good = [run for run in runs if run["failed"] is None]
+    keys = ("psnr", "ssim", "train_seconds", "queries_per_ray", "parameters")
+    means = {key: mean(run[key] for run in good) for key in keys}
+    return {**means, "seeds": len(runs), "failures": len(runs) - len(good)}
+
+
+def table(record: dict[str, Any]) -> str:
+    """The rows as Markdown."""
+    lines = [
+        "| | PSNR (dB) | range | SSIM | train (s) | queries/ray | parameters | failures |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in record["rows"]:
+        values = [run["psnr"] for run in row["runs"] if run["failed"] is None]
+        numbers = [v for v in values if v is not None]
+        spread = f"{min(numbers):.2f} to {max(numbers):.2f}" if len(numbers) > 1 else ""
+        cells = [
+            row["title"],
+            _text(row["psnr"], ".2f"),
+            spread,
+            _text(row["ssim"], ".4f"),
+            _text(row["train_seconds"], ".0f"),
+            _text(row["queries_per_ray"], ".1f"),
+            _text(row["parameters"], ",.0f"),
+            f"{row['failures']} of {row['seeds']}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _text(value: float | None, form: str) -> str:
+    return "n/a" if value is None else format(value, form)
+
+
+def _draw(path: Path, record: dict[str, Any]) -> None:
+    """PSNR of every row: the mean as a bar, the seeds as points."""
+    from matplotlib.figure import Figure
+
+    rows = [row for row in record["rows"] if row["psnr"] is not None]
+    figure = Figure(figsize=(7, 0.9 + 0.4 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    axes.barh(range(len(rows)), [row["psnr"] for row in rows], color="#9db4c9")
+    for place, row in enumerate(rows):
+        values = [run["psnr"] for run in row["runs"] if run.get("psnr") is not None]
+        axes.plot(values, [place] * len(values), "o", color="#1d3a52", markersize=4)
+        axes.annotate(
+            f"{row['psnr']:.2f}", (min(values), place), (-34, -4), textcoords="offset points"
+        )
+    axes.set_yticks(range(len(rows)), [row["title"] for row in rows])
+    axes.invert_yaxis()
+    axes.set_xlim(left=min(row["psnr"] for row in rows) - 3)
+    axes.set_xlabel("PSNR (dB), mean of seeds; points: each seed")
+    with replacing(path) as temporary:
+        figure.savefig(temporary, dpi=150)

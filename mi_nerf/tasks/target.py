@@ -1,0 +1,57 @@
+"""What a command is pointed at: a run folder or a field file."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..base.errors import InputError
+from ..formats.field_file import FieldFile, load_field
+from ..training.run_folder import CONFIG, FIELD, LOG, read_config
+
+
+@dataclass(frozen=True)
+class Target:
+    """A trained field, and what is known of where it comes from."""
+
+    path: Path
+    contents: FieldFile
+    record: dict[str, Any] | None  # config.json of the run; None for a lone field file
+    downscale: int = 1  # the scale at which the run saw its images
+
+    @property
+    def data(self) -> Path | None:
+        """The dataset of the run."""
+        return None if self.record is None else Path(self.record["data"]["path"])
+
+    @property
+    def train_seconds(self) -> float | None:
+        """Wall-clock seconds of training, from the last line of the run's log."""
+        if self.record is None or not (self.path / LOG).exists():
+            return None
+        lines = (self.path / LOG).read_text().splitlines()
+        try:
+            return float(json.loads(lines[-1])["seconds"]) if lines else None
+        except (ValueError, KeyError):
+            return None
+
+
+def open_target(path: str | Path) -> Target:
+    """Opens a run folder or a field file.
+
+    Raises:
+        InputError: if it is neither, or has no field yet.
+    """
+    target = Path(path)
+    if target.is_dir():
+        if not (target / CONFIG).exists():
+            raise InputError(f"{target}: no {CONFIG} in it, expected the folder of a run")
+        config, record = read_config(target)
+        if not (target / FIELD).exists():
+            raise InputError(f"{target}: no {FIELD} yet, expected a run with a checkpoint")
+        return Target(target, load_field(target / FIELD), record, config.downscale)
+    if not target.exists():
+        raise InputError(f"{target}: not found, expected a run folder or a field file")
+    return Target(target, load_field(target), None)

@@ -1,0 +1,84 @@
+"""Copies of instances show what the instances show."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from mi_nerf.base.variants import choose_variant
+from mi_nerf.scene_xml import instancing
+from mi_nerf.scene_xml.scene_file import SceneFile
+
+SCENE = """<scene version="3.0.0">
+    <integrator type="path"/>
+    <sensor type="perspective"><float name="fov" value="40"/>
+        <transform name="to_world">
+            <lookat origin="3, -4, 3" target="0, 0, 0" up="0, 0, 1"/></transform>
+        <film type="hdrfilm"><integer name="width" value="40"/><integer name="height" value="30"/>
+            <string name="pixel_format" value="rgba"/></film>
+    </sensor>
+    <emitter type="constant"/>
+    <bsdf type="diffuse" id="red"><rgb name="reflectance" value="0.8, 0.1, 0.1"/></bsdf>
+    <shape type="shapegroup" id="pair">
+        <shape type="cube" id="low"><ref id="red"/>
+            <transform name="to_world"><scale value="0.2"/><translate x="0.4"/></transform></shape>
+        <shape type="sphere" id="high"><float name="radius" value="0.2"/>
+            <point name="center" value="0, 0, 0.5"/><bsdf type="plastic"/></shape>
+    </shape>
+    <shape type="shapegroup" id="unused"><shape type="sphere"/></shape>
+    <shape type="instance" id="plain"><ref id="pair"/></shape>
+    <shape type="instance" id="turned"><ref id="pair"/>
+        <transform name="to_world"><rotate z="1" angle="50"/><translate x="-0.9" z="-0.3"/>
+        </transform></shape>
+    <shape type="instance" id="tilted"><ref id="pair"/>
+        <transform name="to_world"><rotate x="1" angle="30"/><translate y="0.8"/>
+        </transform></shape>
+    <shape type="rectangle" id="floor"><transform name="to_world"><translate z="-1"/></transform>
+    </shape>
+</scene>"""
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    mi.set_variant(choose_variant())
+    path = tmp_path / "scene.xml"
+    path.write_text(SCENE)
+    return path
+
+
+def test_the_picture_is_the_same(scene: Path) -> None:
+    expected = mi.load_file(str(scene))
+    found = SceneFile(scene).load()
+    kinds = {shape.class_name() for shape in found.shapes()}
+    assert "Instance" in {shape.class_name() for shape in expected.shapes()}
+    assert "Instance" not in kinds and "ShapeGroup" not in kinds
+    images = [np.array(mi.render(s, spp=256, seed=k)) for s, k in ((expected, 0), (found, 1))]
+    assert images[0][..., 3] == pytest.approx(images[1][..., 3], abs=0.2)
+    difference = (images[0] - images[1])[..., :3]
+    assert np.abs(difference.mean(axis=(0, 1))).max() < 2e-3
+    assert np.abs(difference).mean() < 0.015
+
+
+def test_bounds_are_tight(scene: Path) -> None:
+    turned = [s for s in SceneFile(scene).load().shapes() if s.class_name() == "Sphere"]
+    tops = sorted(float(shape.bbox().max.z) for shape in turned)
+    assert tops == pytest.approx([0.4, 0.2 + 0.5 * np.cos(np.pi / 6), 0.7])
+
+
+def test_too_many_stay_instances(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(instancing, "MAX_COPIES", 5)
+    kinds = [shape.class_name() for shape in SceneFile(scene).load().shapes()]
+    assert kinds.count("Instance") == 3
+
+
+def test_scenes_without_instances_are_left_alone(scene: Path) -> None:
+    scene.write_text(
+        SCENE.replace('type="instance"', 'type="sphere"').replace(
+            '<ref id="pair"/>', "<float name='radius' value='0.1'/>"
+        )
+    )
+    shapes = SceneFile(scene).load().shapes()
+    assert sum(shape.class_name() == "Sphere" for shape in shapes) == 3
