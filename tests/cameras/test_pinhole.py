@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mi_nerf.cameras import poses as cameras
 from mi_nerf.base.errors import InputError
+from mi_nerf.cameras import poses as cameras
 from mi_nerf.cameras.pinhole import Intrinsics, pack_poses, pixel_rays, project, sensor_dict
 from mi_nerf.cameras.poses import look_at
 from tests.support.datasets import orbit_poses
