@@ -2,57 +2,75 @@
 
 from __future__ import annotations
 
-import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba.ad.integrators.common import ADIntegrator, RBIntegrator
 
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError
-from .placement import is_field
+
+# What may be nested, by name of the class (after a change of variant, Mitsuba may hold a class of
+# its own twice). Each returns the radiance along a ray, knows nothing of other rays, and has
+# derivatives that tests compare with finite differences.
+_RECORDED = {  # C++, differentiated by recording the paths
+    "PathIntegrator": "path",
+    "DirectIntegrator": "direct",
+    "VolumetricPathIntegrator": "volpath",
+    "VolpathMisIntegratorImpl": "volpathmis",
+}
+_REPLAYED = {  # Python, differentiated by following the same paths once more
+    "PRBIntegrator": "prb",
+    "BasicPRBIntegrator": "prb_basic",
+    "PathProjectiveIntegrator": "prb_projective",
+    "PRBVolpathIntegrator": "prbvolpath",
+}
 
 
-@dataclass
-class Behind:
-    """What camera rays meet where fields do not stop them."""
+@dataclass(frozen=True)
+class Hit:
+    """Where camera rays end: at the first surface, or nowhere."""
 
-    distance: Any = None  # to the first surface, infinite where there is none; None: nowhere
-    normal: Any = None  # of that surface, in world coordinates; 0 where there is none
-    radiance: list[Any] = dataclasses.field(default_factory=list)  # R, G, B
-    valid: Any = None  # 1 where there is something opaque, to the film's alpha channel
-    states: Any = None  # of the nested integrator, which some need for derivatives
+    distance: Any = None  # infinite where there is no surface; None: nowhere at all
+    normal: Any = None  # of the surface, in world coordinates; 0 where there is none
+
+
+@dataclass(frozen=True)
+class Light:
+    """What arrives from there, as if no fields were before it."""
+
+    radiance: list[Any]  # R, G, B
+    valid: Any  # 1 where there is something opaque, to the film's alpha channel
+    states: list[Any] = field(default_factory=list)  # of the nested integrator, path by path
 
 
 class Backdrop(ABC):
     """All that is no field: says first how far fields can be seen, then what is behind them."""
 
     @abstractmethod
-    def meet(self, ray: Any) -> Behind:
-        """Distance and normal of what the rays meet first."""
+    def intersect(self, ray: Any) -> Hit:
+        """Distance and normal of the surface that rays meet first."""
 
     @abstractmethod
-    def look(self, behind: Behind, ray: Any, sampler: Any, opacity: Any) -> None:
-        """Fills in the radiance from there, and ``valid``.
+    def shade(self, hit: Any, ray: Any, sampler: Any, opacity: Any) -> Light:
+        """The light that comes from there.
 
         Args:
-            behind: what :meth:`meet` returned.
-            opacity: of the fields before it, which says how much the radiance matters. The
-                radiance is what arrives without them.
+            hit: what :meth:`intersect` returned.
+            opacity: of the fields before it, which says how much the light matters.
         """
 
-    @abstractmethod
-    def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
+    def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
         """Carries gradients of the radiance to the parameters of surfaces and lights."""
+        raise NotImplementedError
 
-    @abstractmethod
-    def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
+    def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
         """The derivative of the radiance along the gradients of surfaces and lights."""
+        raise NotImplementedError
 
 
 class Environment(Backdrop):
@@ -63,20 +81,20 @@ class Environment(Backdrop):
         self._emitter = scene.environment() if visible else None
         self._encoded = encoded
 
-    def meet(self, ray: Any) -> Behind:
+    def intersect(self, ray: Any) -> Hit:
         """Nothing, at any distance."""
-        return Behind()
+        return Hit()
 
-    def look(self, behind: Behind, ray: Any, sampler: Any, opacity: Any) -> None:
+    def shade(self, hit: Hit, ray: Any, sampler: Any, opacity: Any) -> Light:
         """Radiance from along the rays."""
-        behind.radiance, behind.valid = self._radiance(ray), mi.Float(0)
+        return Light(self._radiance(ray), mi.Float(0))
 
-    def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
+    def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
         """Carries gradients of the radiance to the emitter."""
         with dr.resume_grad():
             _backward(self._radiance(ray), gradients)
 
-    def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
+    def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
         """The derivative of the radiance along the gradients of the emitter."""
         with dr.resume_grad():
             return _forward(self._radiance(ray))
@@ -98,25 +116,26 @@ class Surfaces(Backdrop):
     ) -> None:
         """
         Args:
-            scene: without the cubes, see :class:`SolidScene`.
+            scene: without the cubes, see :class:`mi_nerf.plugins.solid_scene.SolidScene`.
             paths: how often the integrator is asked about every ray.
             normals: whether normals are wanted.
         """
         self._scene, self._integrator = scene, integrator
+        self._replayed = _class_name(integrator) in _REPLAYED
         self._paths, self._normals = paths, normals
 
-    def meet(self, ray: Any) -> Behind:
+    def intersect(self, ray: Any) -> Hit:
         """The first surface along the rays."""
         if not self._normals:
             pi = self._scene.ray_intersect_preliminary(mi.Ray3f(ray), coherent=True)
-            behind = Behind(pi.t, mi.Normal3f(0))
+            hit = Hit(pi.t, mi.Normal3f(0))
         else:
             si = self._scene.ray_intersect(mi.Ray3f(ray), mi.RayFlags.All, coherent=True)
-            behind = Behind(si.t, dr.select(si.is_valid(), si.sh_frame.n, 0))
-        dr.eval(behind.distance, behind.normal)
-        return behind
+            hit = Hit(si.t, dr.select(si.is_valid(), si.sh_frame.n, 0))
+        dr.eval(hit.distance, hit.normal)
+        return hit
 
-    def look(self, behind: Behind, ray: Any, sampler: Any, opacity: Any) -> None:
+    def shade(self, hit: Hit, ray: Any, sampler: Any, opacity: Any) -> Light:
         """What the nested integrator returns for the rays, on average."""
         total, states, valid = mi.Color3f(0), [], mi.Bool(False)
         sampler = sampler.clone()
@@ -126,18 +145,18 @@ class Surfaces(Backdrop):
             states.append(state)
             sampler.schedule_state()
             dr.eval(total, valid, state)
-        behind.radiance = list(total * (1 / self._paths))
-        behind.valid, behind.states = dr.select(valid, mi.Float(1), 0), states
-        dr.eval(behind.radiance, behind.valid)
+        light = Light(list(total * (1 / self._paths)), dr.select(valid, mi.Float(1), 0), states)
+        dr.eval(light.radiance, light.valid)
+        return light
 
-    def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
+    def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
         """Carries gradients of the radiance to the parameters of surfaces and lights."""
         if not self._differentiable():
             return
         pull = mi.Color3f(*gradients) * (1 / self._paths)
         sampler = sampler.clone()
-        for state in seen.states:
-            if isinstance(self._integrator, RBIntegrator):
+        for state in light.states:
+            if self._replayed:
                 self._sample(dr.ADMode.Backward, ray, sampler, pull, state)
             else:
                 with dr.resume_grad(), _differentiable_loops():
@@ -146,14 +165,19 @@ class Surfaces(Backdrop):
             sampler.schedule_state()
             dr.eval()
 
-    def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
+    def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
         """The derivative of the radiance along the gradients of surfaces and lights."""
         total = dr.zeros(mi.Color3f, dr.width(ray))
         if not self._differentiable():
             return list(total)
+        if _class_name(self._integrator) == "PRBVolpathIntegrator":
+            raise InputError(
+                "nerf: nested integrator 'prbvolpath' has no derivatives in forward mode, "
+                "expected 'volpath' or 'prb'"
+            )
         sampler = sampler.clone()
-        for state in seen.states:
-            if isinstance(self._integrator, RBIntegrator):
+        for state in light.states:
+            if self._replayed:
                 total += self._sample(dr.ADMode.Forward, ray, sampler, None, state)[0]
             else:
                 with dr.resume_grad(), _differentiable_loops():
@@ -173,7 +197,7 @@ class Surfaces(Backdrop):
     ) -> tuple[Any, Any, Any]:
         """Radiance, validity and state of one path a ray."""
         scene = self._scene
-        if not isinstance(self._integrator, ADIntegrator):
+        if not self._replayed:
             radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, True)
             return radiance, valid, None
         radiance, valid, _, state = self._integrator.sample(
@@ -190,112 +214,21 @@ class Surfaces(Backdrop):
         return radiance, valid, state
 
 
-class SolidScene:
-    """A scene without the cubes of its fields; made again when shapes have changed.
-
-    A path tracer must not meet the cubes: even with a ``null`` BSDF they cast shadows on
-    whatever they contain.
-    """
-
-    def __init__(self) -> None:
-        self._made_of: list[Any] = []
-        self._scene: mi.Scene | None = None
-
-    def of(self, scene: mi.Scene) -> mi.Scene:
-        """The scene, less its cubes, in its present state."""
-        parts = [
-            part
-            for part in _parts(scene)
-            if isinstance(part, mi.Shape | mi.Emitter) and not _holds_field(part)
-        ]
-        lights = [v for part in parts for v in _parts(part) if isinstance(v, mi.Emitter)]
-        made_of = [v for part in parts + lights for v in (part, *_parts(part))]
-        if self._scene is None or not _same(made_of, self._made_of):
-            props = mi.Properties("scene")
-            for i, part in enumerate(parts):
-                props[f"part_{i}"] = part
-            self._scene, self._made_of = mi.Scene(props), made_of
-        return self._scene
-
-
 def check_nested(integrator: Any) -> None:
-    """Refuses integrators that cannot say what is seen along a ray.
+    """Refuses integrators that cannot say what is seen along a ray, and how that changes.
 
     Raises:
         InputError: naming the integrator.
     """
-    name = integrator.class_name()
-    if not isinstance(integrator, mi.SamplingIntegrator):
-        raise InputError(
-            f"nerf: nested integrator '{name}' cannot look along single rays, "
-            "expected one like 'path' or 'prb'"
-        )
-    if integrator.aov_names():
-        raise InputError(
-            f"nerf: nested integrator '{name}' has channels of its own, "
-            "expected one like 'path' or 'prb', and 'aovs' on the integrator 'nerf'"
-        )
+    name, known = _class_name(integrator), _RECORDED | _REPLAYED
+    if name not in known:
+        raise InputError(f"nerf: nested integrator '{name}', expected {', '.join(known.values())}")
 
 
-def has_surfaces(scene: mi.Scene) -> bool:
-    """Whether a scene holds any shape but cubes of fields."""
-    return not all(_holds_field(shape) for shape in scene.shapes())
-
-
-def check_no_loose_field(scene: mi.Scene) -> None:
-    """Refuses a field that is part of the scene, but not of any of its shapes.
-
-    Raises:
-        InputError: naming it.
-    """
-    for part in _parts(scene):
-        if isinstance(part, mi.Medium) and is_field(part):
-            raise InputError(
-                f"nerfmedium: '{part.id()}' is in no shape, expected the interior of a 'cube'"
-            )
-
-
-def _holds_field(part: Any) -> bool:
-    return isinstance(part, mi.Shape) and is_field(part.interior_medium())
-
-
-class _Children(mi.TraversalCallback):
-    """Takes down everything that an object says it consists of."""
-
-    def __init__(self, node: Any) -> None:
-        super().__init__()
-        self._node = node
-        self.values: list[Any] = []
-
-    def put(self, name: str, value: Any, flags: Any = None, kind: Any = None) -> None:
-        """Called by the object."""
-        self.values.append(value if kind is None else mi.get_property(value, kind, self._node))
-
-
-def _parts(node: Any) -> list[Any]:
-    """Objects and values, without history, that an object consists of."""
-    children = _Children(node)
-    node.traverse(children)
-    return [dr.detach(value) for value in children.values]
-
-
-def _same(a: list[Any], b: list[Any]) -> bool:
-    """Whether lists hold the very same objects and arrays, not just equal ones."""
-    return len(a) == len(b) and all(
-        x is y or (type(x) is type(y) and _identity(x) == _identity(y))
-        for x, y in zip(a, b, strict=True)
-    )
-
-
-def _identity(value: Any) -> Any:
-    """What tells a value from all others that are alive."""
-    if isinstance(value, mi.Object):
-        return id(value)
-    if isinstance(value, mi.Transform4f):
-        value = value.matrix
-    if not dr.is_jit_v(value):
-        return value
-    return [_identity(v) for v in value] if dr.depth_v(value) > 1 else value.index
+def _class_name(integrator: Any) -> str:
+    """The name of an integrator's class, in C++ or Python."""
+    name = type(integrator).__name__
+    return name if name in _REPLAYED else str(integrator.class_name())
 
 
 @contextmanager

@@ -12,7 +12,7 @@ import numpy as np
 from ..base.arrays import upload
 from ..base.box import Corner
 from ..march.intervals import box_interval
-from .crossing import Marched
+from .marched import Marched
 from .placement import Matrix, PlacedField
 
 

@@ -1,11 +1,17 @@
-"""What integrators that show radiance fields have in common: camera rays and film."""
+"""What integrators that show radiance fields have in common: camera rays and film.
+
+Forwards: film position → camera ray → what the scene shows along it → the film's reconstruction
+filter. Backwards, as in Mitsuba's ``RBIntegrator``: first from the image to the film's sums, then
+pass by pass from these to the values of the rays, and from there into the scene. The sums are
+linear in the values, so that no pass needs to know another one's.
+"""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -16,9 +22,12 @@ from ..base.errors import InputError
 _AXES = (".X", ".Y", ".Z")
 
 
-@dataclass
-class Wave:
-    """The camera rays of one pass; subclasses add what these return."""
+Channels = dict[str, Any]  # color, alpha, and what else an integrator knows, ray by ray
+
+
+@dataclass(frozen=True)
+class CameraRays:
+    """The camera rays of one pass."""
 
     ray: Any
     weight: Any
@@ -26,9 +35,41 @@ class Wave:
     random: Any  # what the integrator needs of randomness, a number or so a ray
     sampler: mi.Sampler  # in the state in which a nested integrator finds it
 
-    def shown(self) -> dict[str, Any]:
-        """``color``, ``alpha``, and all channels that the integrator knows."""
-        raise NotImplementedError
+
+class Traced(Protocol):
+    """What the rays of a pass have found."""
+
+    @property
+    def camera(self) -> CameraRays:
+        """The rays."""
+
+    def channels(self) -> Channels:
+        """What they show."""
+
+
+class DifferentiableTraced(Traced, Protocol):
+    """The same, where derivatives can be had."""
+
+    @property
+    def outputs(self) -> list[Any]:
+        """The arrays of which the channels are made."""
+
+
+class TracedScene(Protocol):
+    """A scene as it is now, to be seen along camera rays."""
+
+    def trace(self, camera: CameraRays) -> Any:
+        """What the rays find, a :class:`Traced`; without derivatives."""
+
+
+class DifferentiableScene(TracedScene, Protocol):
+    """A scene with derivatives with respect to its parameters."""
+
+    def backward(self, traced: Any, gradients: list[Any]) -> None:
+        """Carries gradients of the ``outputs`` to the parameters."""
+
+    def forward(self, traced: Any) -> list[Any]:
+        """The derivatives of the ``outputs`` along the gradients of the parameters."""
 
 
 class FieldIntegrator(ADIntegrator):
@@ -36,8 +77,8 @@ class FieldIntegrator(ADIntegrator):
 
     plugin: str  # its name
     known: tuple[str, ...]  # extra channels that it offers
-    wave: type[Wave]
     rays_per_pass = 1 << 22  # traced at a time; more samples per pixel take several passes
+    rays_per_adjoint = 1 << 18  # the same for derivatives, which keep more of every ray
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -63,11 +104,11 @@ class FieldIntegrator(ADIntegrator):
 
     @abstractmethod
     def _draw(self, sampler: mi.Sampler, rays: int, seed: Any) -> Any:
-        """Takes from the sampler what a wave needs of randomness."""
+        """Takes from the sampler what the rays of a pass need of randomness."""
 
     @abstractmethod
-    def _traced(self, scene: mi.Scene, waves: Iterable[Any]) -> Iterator[Any]:
-        """Fills in what the rays of such waves see, without derivatives."""
+    def _scene(self, scene: mi.Scene) -> Any:
+        """The scene as it is now: a :class:`TracedScene`."""
 
     # ---------------------------------- Rendering ----------------------------------
 
@@ -82,23 +123,102 @@ class FieldIntegrator(ADIntegrator):
     ) -> Any:
         """Renders an image; see ``mi.render``."""
         sensor = self._sensor(scene, sensor)
+        film, block = sensor.film(), None
         with dr.suspend_grad():
-            waves = self._traced(scene, self._waves(scene, sensor, seed, spp))
-            image = self._develop(sensor.film(), waves, develop)
+            view = self._scene(scene)
+            for camera in self._passes(scene, sensor, seed, spp, self.rays_per_pass):
+                block = self._splat(film, block, camera, view.trace(camera).channels())
+            film.put_block(block)
+            image = film.develop() if develop else None
             if evaluate and develop:
                 dr.eval(image)
         return image
 
     def sample(
-        self, mode: Any, scene: mi.Scene, sampler: mi.Sampler, ray: Any, **kwargs: Any
+        self,
+        mode: Any,
+        scene: mi.Scene,
+        sampler: mi.Sampler,
+        ray: Any,
+        active: Any = True,
+        **kwargs: Any,
     ) -> tuple[Any, Any, list[Any], Any]:
-        """Radiance along single rays, for integrators that nest this one."""
+        """Radiance along single rays, for integrators that nest this one; 0 if not active."""
         with dr.suspend_grad():
-            wave = self.wave(ray, None, None, self._draw(sampler, dr.width(ray), 0), sampler)
-            for _ in self._traced(scene, [wave]):
-                pass
-            shown = wave.shown()
-        return shown["color"], shown["alpha"] > 0, self._aov_values(shown), None
+            random = self._draw(sampler, dr.width(ray), 0)
+            channels = (
+                self._scene(scene).trace(CameraRays(ray, None, None, random, sampler)).channels()
+            )
+            active = mi.Bool(active)
+            color = dr.select(active, channels["color"], 0)
+            aovs = [dr.select(active, value, 0) for value in self._aov_values(channels)]
+        return color, active & (channels["alpha"] > 0), aovs, None
+
+    # ---------------------------------- Derivatives ----------------------------------
+
+    def _render_backward(
+        self, scene: mi.Scene, grad_in: Any, sensor: int | mi.Sensor, seed: Any, spp: int
+    ) -> None:
+        """Carries the gradient of an image to the scene, pass by pass."""
+        sensor = self._sensor(scene, sensor)
+        film, limit = sensor.film(), self.rays_per_adjoint
+        with dr.suspend_grad():
+            view: DifferentiableScene = self._scene(scene)
+            sums = self._weights(scene, sensor, seed, spp)
+            with dr.resume_grad():
+                dr.enable_grad(sums.tensor())
+                film.put_block(sums)
+                _pull(film.develop(), grad_in)
+                adjoint = dr.grad(sums.tensor())
+            for camera in self._passes(scene, sensor, seed, spp, limit):
+                traced: DifferentiableTraced = view.trace(camera)
+                outputs = traced.outputs
+                with dr.resume_grad():
+                    dr.enable_grad(outputs)
+                    block = self._splat(film, None, camera, traced.channels(), evaluate=False)
+                    _pull(block.tensor(), adjoint)
+                    gradients = [dr.grad(output) for output in outputs]
+                dr.eval(gradients)
+                dr.disable_grad(outputs)
+                view.backward(traced, gradients)
+                dr.eval()
+
+    def _render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: Any, spp: int) -> Any:
+        """The derivative of an image along the gradients of the scene, pass by pass."""
+        sensor = self._sensor(scene, sensor)
+        film, limit = sensor.film(), self.rays_per_adjoint
+        with dr.suspend_grad():
+            view: DifferentiableScene = self._scene(scene)
+            sums = self._weights(scene, sensor, seed, spp)
+            tangent = dr.zeros(mi.TensorXf, sums.tensor().shape)
+            for camera in self._passes(scene, sensor, seed, spp, limit):
+                traced: DifferentiableTraced = view.trace(camera)
+                outputs, slopes = traced.outputs, view.forward(traced)
+                with dr.resume_grad():
+                    dr.enable_grad(outputs)
+                    for output, slope in zip(outputs, slopes, strict=True):
+                        dr.set_grad(output, slope)
+                    block = self._splat(film, None, camera, traced.channels(), evaluate=False)
+                    dr.forward_to(block.tensor())
+                    tangent += dr.grad(block.tensor())
+                dr.disable_grad(outputs)
+                dr.eval(tangent)
+            with dr.resume_grad():
+                dr.enable_grad(sums.tensor())
+                dr.set_grad(sums.tensor(), tangent)
+                film.put_block(sums)
+                image = film.develop()
+                dr.forward_to(image)
+                return dr.grad(image)
+
+    def _weights(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> mi.ImageBlock:
+        """The film's sums of an image that is black: only the weights of the samples."""
+        block, zero = None, mi.Float(0)
+        black: Channels = dict.fromkeys(self.known, zero)
+        black |= {"color": mi.Color3f(0), "alpha": zero, "normal": mi.Normal3f(0)}
+        for camera in self._passes(scene, sensor, seed, spp, self.rays_per_adjoint):
+            block = self._splat(sensor.film(), block, camera, black)
+        return block
 
     # ---------------------------------- Camera rays ----------------------------------
 
@@ -113,12 +233,14 @@ class FieldIntegrator(ADIntegrator):
             )
         return sensors[sensor]
 
-    def _waves(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> Iterator[Any]:
-        """Camera rays, in passes of bounded size with seeds of their own."""
+    def _passes(
+        self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int, limit: int
+    ) -> Iterator[CameraRays]:
+        """Camera rays, in passes of at most ``limit`` or one a pixel, with seeds of their own."""
         film = sensor.film()
         spp = spp or sensor.sampler().sample_count()
         pixels = int(dr.prod(film.crop_size()))
-        per_pass = max(1, min(spp, self.rays_per_pass // max(pixels, 1)))
+        per_pass = max(1, min(spp, limit // max(pixels, 1)))
         passes = -(-spp // per_pass)
         for i in range(passes):
             count = spp if passes == 1 else min(per_pass, spp - i * per_pass)
@@ -129,33 +251,37 @@ class FieldIntegrator(ADIntegrator):
             dr.eval(ray, weight, position, random)
             sampler.schedule_state()
             dr.eval()
-            yield self.wave(ray, weight, position, random, sampler)
+            yield CameraRays(ray, weight, position, random, sampler)
 
-    def _develop(self, film: mi.Film, waves: Iterable[Wave], develop: bool) -> Any:
-        """Splats the rays' values through the film's reconstruction filter."""
-        block = None
-        for wave in waves:
-            block = block or film.create_block()
-            shown = wave.shown()
-            ADIntegrator._splat_to_block(
-                block,
-                film,
-                wave.position,
-                value=shown["color"] * wave.weight,
-                weight=1.0,
-                alpha=shown["alpha"],
-                aovs=self._aov_values(shown),
-                wavelengths=wave.ray.wavelengths,
-            )
+    def _splat(
+        self,
+        film: mi.Film,
+        block: mi.ImageBlock | None,
+        camera: CameraRays,
+        channels: Channels,
+        evaluate: bool = True,
+    ) -> mi.ImageBlock:
+        """Adds the rays' values to the film's sums, through its reconstruction filter."""
+        block = block or film.create_block()
+        ADIntegrator._splat_to_block(
+            block,
+            film,
+            camera.position,
+            value=channels["color"] * camera.weight,
+            weight=1.0,
+            alpha=channels["alpha"],
+            aovs=self._aov_values(channels),
+            wavelengths=camera.ray.wavelengths,
+        )
+        if evaluate:
             dr.eval(block.tensor())  # lets go of this pass before the next one
-        film.put_block(block)
-        return film.develop() if develop else None
+        return block
 
-    def _aov_values(self, shown: dict[str, Any]) -> list[Any]:
+    def _aov_values(self, channels: Channels) -> list[Any]:
         return [
             value
             for _, kind in self.aovs
-            for value in (shown[kind] if kind == "normal" else [shown[kind]])
+            for value in (channels[kind] if kind == "normal" else [channels[kind]])
         ]
 
     def _parse_aovs(self, text: str) -> list[tuple[str, str]]:
@@ -169,3 +295,10 @@ class FieldIntegrator(ADIntegrator):
             if item:
                 aovs.append((name or kind, kind))
         return aovs
+
+
+def _pull(value: Any, gradient: Any) -> None:
+    """Carries the gradient of a value to what it was made of."""
+    dr.set_grad(value, gradient)
+    dr.enqueue(dr.ADMode.Backward, value)
+    dr.traverse(dr.ADMode.Backward)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any, get_args
 
@@ -12,17 +10,15 @@ import mitsuba as mi
 from ..base.errors import InputError
 from ..march.quadrature import Rule
 from ..march.settings import MarchSettings
-from .crossing import Marched
 from .film import FieldIntegrator
+from .marched import Marched
 from .placement import PlacedField
-from .stage import Stage, StageWave
 
 
 class MarchingIntegrator(FieldIntegrator):
     """Shows fields by quadrature, before something else; what that is, is up to subclasses."""
 
     known = ("depth", "opacity", "normal", "index")
-    wave = StageWave
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -57,16 +53,9 @@ class MarchingIntegrator(FieldIntegrator):
             f"  aovs = {self.aov_names()},\n"
         )
 
-    @abstractmethod
-    def _stage(self, scene: mi.Scene) -> Stage:
-        """The scene as it is now."""
-
     def _draw(self, sampler: mi.Sampler, rays: int, seed: Any) -> Any:
         """One offset a ray, or ``None``."""
         return sampler.next_1d() if self.jitter else None
-
-    def _traced(self, scene: mi.Scene, waves: Iterable[StageWave]) -> Iterator[StageWave]:
-        return traced(self._stage(scene), waves)
 
     def _marched(self, found: list[PlacedField], encoded: bool = False) -> list[Marched]:
         """The fields of the scene, and how they are sampled."""
@@ -90,10 +79,3 @@ class MarchingIntegrator(FieldIntegrator):
                 "expected none"
             )
         return normals
-
-
-def traced(stage: Stage, waves: Iterable[StageWave]) -> Iterator[StageWave]:
-    """The waves, filled in with what their rays see."""
-    for wave in waves:
-        stage.trace(wave)
-        yield wave

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import mitsuba as mi
 
 from ..base.errors import InputError
-from .backdrop import Backdrop, Environment, SolidScene, Surfaces, check_nested, has_surfaces
+from .backdrop import Backdrop, Environment, Surfaces, check_nested
+from .field_scene import FieldScene
 from .film import FieldIntegrator
-from .marching import MarchingIntegrator, traced
+from .marching import MarchingIntegrator
 from .placement import find_fields
-from .stage import Stage
+from .solid_scene import SolidScene, has_surfaces
 
 
 class NerfIntegrator(MarchingIntegrator):
@@ -173,26 +173,11 @@ class NerfIntegrator(MarchingIntegrator):
     ) -> None:
         """Carries the gradient of an image to the parameters of fields, surfaces and lights.
 
-        First to the values of the camera rays, through reconstruction filter and film,
-        then chunk by chunk through quadrature and network: memory does not grow with
-        the image.
+        First to the film's sums, then pass by pass to the values of camera rays, and chunk by
+        chunk through quadrature and network: memory grows neither with the image nor with
+        the samples per pixel.
         """
-        sensor = self._sensor(scene, sensor)
-        with dr.suspend_grad():
-            stage = self._stage(scene)
-            waves = list(traced(stage, self._waves(scene, sensor, seed, spp)))
-            with dr.resume_grad():
-                for wave in waves:
-                    dr.enable_grad(wave.outputs)
-                image = self._develop(sensor.film(), waves, True)
-                dr.set_grad(image, grad_in)
-                dr.enqueue(dr.ADMode.Backward, image)
-                dr.traverse(dr.ADMode.Backward)
-                adjoints = [[dr.grad(output) for output in wave.outputs] for wave in waves]
-            dr.eval(adjoints)
-            for wave, gradients in zip(waves, adjoints, strict=True):
-                dr.disable_grad(wave.outputs)
-                stage.backward(wave, gradients)
+        self._render_backward(scene, grad_in, sensor, seed, spp)
 
     def render_forward(
         self,
@@ -203,24 +188,11 @@ class NerfIntegrator(MarchingIntegrator):
         spp: int = 0,
     ) -> Any:
         """The derivative of an image along the gradients of the scene's parameters."""
-        sensor = self._sensor(scene, sensor)
-        with dr.suspend_grad():
-            stage = self._stage(scene)
-            waves = list(traced(stage, self._waves(scene, sensor, seed, spp)))
-            for wave in waves:
-                tangents = stage.forward(wave)
-                with dr.resume_grad():
-                    for output, tangent in zip(wave.outputs, tangents, strict=True):
-                        dr.enable_grad(output)
-                        dr.set_grad(output, tangent)
-            with dr.resume_grad():
-                image = self._develop(sensor.film(), waves, True)
-                dr.forward_to(image)
-                return dr.grad(image)
+        return self._render_forward(scene, sensor, seed, spp)
 
     # ---------------------------------- Scene ----------------------------------
 
-    def _stage(self, scene: mi.Scene) -> Stage:
+    def _scene(self, scene: mi.Scene) -> FieldScene:
         """The scene as it is now."""
         found = find_fields(scene)
         encoded = self.encoded and found[0].medium.field.color_space == "srgb"
@@ -237,7 +209,7 @@ class NerfIntegrator(MarchingIntegrator):
             backdrop = Environment(scene, self.show_background, encoded)
         else:
             backdrop = Surfaces(self._solid.of(scene), self.nested, self.paths, normals)
-        return Stage(fields, backdrop, normals)
+        return FieldScene(fields, backdrop, normals)
 
     def _warn_of_surfaces(self, scene: mi.Scene) -> None:
         if not self._warned and has_surfaces(scene):

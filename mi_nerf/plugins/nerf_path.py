@@ -7,12 +7,12 @@ from typing import Any
 import mitsuba as mi
 
 from ..base.errors import InputError
-from .backdrop import SolidScene, check_no_loose_field
+from .field_scene import FieldScene
 from .marching import MarchingIntegrator
 from .path_state import PathSettings
 from .paths import PathsBehind
 from .placement import find_fields
-from .stage import Stage
+from .solid_scene import SolidScene, check_no_loose_field
 
 
 class NerfPathIntegrator(MarchingIntegrator):
@@ -139,7 +139,7 @@ class NerfPathIntegrator(MarchingIntegrator):
         """Refused: there are no derivatives."""
         raise InputError(_NO_DERIVATIVES)
 
-    def _stage(self, scene: mi.Scene) -> Stage:
+    def _scene(self, scene: mi.Scene) -> FieldScene:
         """The scene as it is now."""
         found = find_fields(scene, least=0)
         if not found:
@@ -156,7 +156,7 @@ class NerfPathIntegrator(MarchingIntegrator):
             stop=min((field.march.stop for field in fields), default=0.0),
         )
         solid = self._solid.of(scene)
-        return Stage(fields, PathsBehind(solid, fields, settings, normals), normals)
+        return FieldScene(fields, PathsBehind(solid, fields, settings, normals), normals)
 
 
 _UNLIMITED = 2**31 - 1

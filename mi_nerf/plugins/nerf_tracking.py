@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -16,22 +15,51 @@ from ..estimators.tracking import track
 from ..march.intervals import ray_segments
 from ..march.quadrature import over_background
 from .backdrop import Environment
-from .crossing import Marched
-from .film import FieldIntegrator, Wave
+from .film import CameraRays, Channels, FieldIntegrator
+from .marched import Marched
 from .placement import find_fields
 
 
-@dataclass
-class TrackedWave(Wave):
-    """Camera rays, and an estimate of what they see."""
+@dataclass(frozen=True)
+class Tracked:
+    """What camera rays see, by an estimate."""
 
-    color: list[Any] = field(default_factory=list)  # in front of the environment
-    opacity: Any = None
+    camera: CameraRays
+    color: list[Any]  # in front of the environment
+    opacity: Any
 
-    def shown(self) -> dict[str, Any]:
+    def channels(self) -> Channels:
         """Colour and opacity."""
         color = mi.Color3f(*self.color)
         return {"color": color, "alpha": self.opacity, "opacity": self.opacity}
+
+
+@dataclass(frozen=True)
+class TrackedScene:
+    """The field of a scene before its environment, for the time of one rendering."""
+
+    marched: Marched
+    environment: Environment
+    majorants: Majorants
+    grow: bool  # whether rays may correct the majorants
+
+    def trace(self, camera: CameraRays) -> Tracked:
+        """Follows the rays of a pass."""
+        marched, ray = self.marched, camera.ray
+        o, d, scale = marched.placed.to_local(ray.o, ray.d)
+        segments = ray_segments(marched.field, o, d, marched.bounds(ray.maxt, scale))
+        seen = track(
+            marched.field,
+            segments,
+            self.majorants,
+            camera.random,
+            grow=self.grow,
+            block=marched.march.block,
+        )
+        hit = self.environment.intersect(ray)
+        light = self.environment.shade(hit, ray, camera.sampler, seen.opacity)
+        color = over_background(seen.color, seen.opacity, light.radiance)
+        return Tracked(camera, color, seen.opacity)
 
 
 class NerfTrackingIntegrator(FieldIntegrator):
@@ -92,7 +120,6 @@ class NerfTrackingIntegrator(FieldIntegrator):
 
     plugin = "nerf_tracking"
     known = ("opacity",)
-    wave = TrackedWave
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -133,26 +160,16 @@ class NerfTrackingIntegrator(FieldIntegrator):
         state = (mi.UInt64(second[0]) << 32) | mi.UInt64(second[1])
         return mi.PCG32(initstate=state, initseq=dr.arange(mi.UInt64, rays))
 
-    def _traced(self, scene: mi.Scene, waves: Iterable[TrackedWave]) -> Iterator[TrackedWave]:
+    def _scene(self, scene: mi.Scene) -> TrackedScene:
         marched = self._marched(scene)
-        tracked, medium = marched.field, marched.placed.medium
-        encoded = tracked.color_space == "srgb"
-        environment = Environment(scene, self.show_background, encoded)
-        fixed = self.majorant is not None
-        if fixed:
-            majorants = Majorants.constant(tracked, self.majorant, medium.occupancy, mi.Float)
-        else:
-            majorants = Majorants.seen(tracked, medium.occupancy, mi.Float)
-        for wave in waves:
-            o, d, scale = marched.placed.to_local(wave.ray.o, wave.ray.d)
-            segments = ray_segments(tracked, o, d, marched.bounds(wave.ray.maxt, scale))
-            block = medium.march.block
-            seen = track(tracked, segments, majorants, wave.random, grow=not fixed, block=block)
-            behind = environment.meet(wave.ray)
-            environment.look(behind, wave.ray, wave.sampler, seen.opacity)
-            wave.color = over_background(seen.color, seen.opacity, behind.radiance)
-            wave.opacity = seen.opacity
-            yield wave
+        field, occupancy = marched.field, marched.placed.medium.occupancy
+        environment = Environment(scene, self.show_background, field.color_space == "srgb")
+        if self.majorant is None:
+            return TrackedScene(
+                marched, environment, Majorants.seen(field, occupancy, mi.Float), True
+            )
+        majorants = Majorants.constant(field, self.majorant, occupancy, mi.Float)
+        return TrackedScene(marched, environment, majorants, False)
 
     def _marched(self, scene: mi.Scene) -> Marched:
         """The field of the scene."""

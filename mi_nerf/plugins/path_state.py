@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .crossing import Rays
+from .marched import Rays
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Paths:
     d: Any
     throughput: Any
     eta: Any  # by which throughput was scaled at refractions
-    clear: Any  # what is left of a camera ray that went straight on; 0 after a turn
+    transmittance: Any  # of what a camera ray that went straight on has passed; 0 after a turn
     vertex: Any  # the surface that the segment comes from
     pdf: Any  # of its direction, by the surface's BSDF
     delta: Any  # whether that has no density: emitters and fields cannot be sampled so

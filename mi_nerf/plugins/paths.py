@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 from mitsuba.ad.integrators.common import mis_weight
 
-from .backdrop import Backdrop, Behind
-from .crossing import Marched, Rays
+from .backdrop import Backdrop, Hit, Light
 from .field_light import FieldLight
+from .integral import see, transmittance
+from .marched import Marched, Rays
 from .path_state import Chance, Connections, Ends, Image, Paths, PathSettings, gather
-from .segments import see, transmittance
 
 _MOST_SURVIVE = 0.95  # of a wavefront in Russian roulette, as in Mitsuba's path tracer
+
+
+@dataclass(frozen=True)
+class PathHit(Hit):
+    """The same, and where paths set out."""
+
+    ends: Any = None  # an :class:`Ends`
 
 
 class PathsBehind(Backdrop):
@@ -45,42 +53,34 @@ class PathsBehind(Backdrop):
 
     # ---------------------------------- What cameras see ----------------------------------
 
-    def meet(self, ray: Any) -> Behind:
+    def intersect(self, ray: Any) -> PathHit:
         """The first surface along the rays."""
         ray = mi.Ray3f(ray)
         start, pi = ray, self._scene.ray_intersect_preliminary(ray, coherent=True)
         if self._settings.hide_lights:
             start, pi = self._behind_lights(ray, pi)
-        behind = Behind(dr.dot(start.o - ray.o, ray.d) + pi.t, mi.Normal3f(0))
+        distance, normal = dr.dot(start.o - ray.o, ray.d) + pi.t, mi.Normal3f(0)
         if self._normals:
             si = pi.compute_surface_interaction(start, mi.RayFlags.All)
-            behind.normal = dr.select(si.is_valid(), si.sh_frame.n, 0)
-        behind.states = Ends(start, pi)
-        dr.eval(behind.distance, behind.normal, start, pi)
-        return behind
+            normal = dr.select(si.is_valid(), si.sh_frame.n, 0)
+        dr.eval(distance, normal, start, pi)
+        return PathHit(distance, normal, Ends(start, pi))
 
-    def look(self, behind: Behind, ray: Any, sampler: Any, opacity: Any) -> None:
+    def shade(self, hit: PathHit, ray: Any, sampler: Any, opacity: Any) -> Light:
         """The radiance from there on, on average over paths."""
-        settings, count = self._settings, dr.width(behind.distance)
+        settings, count = self._settings, dr.width(hit.distance)
         image = Image(dr.zeros(mi.Color3f, count), dr.zeros(mi.Float, count))
         dr.make_opaque(image.radiance, image.alpha)
         sampler = sampler.clone()
         going = dr.compress(1 - opacity > settings.stop) if settings.max_depth else mi.UInt32()
         for _ in range(settings.paths):
-            self._follow(behind.states, mi.UInt32(going), sampler, image)
-        behind.radiance = list(image.radiance * (1 / settings.paths))
-        behind.valid = dr.fmin(image.alpha * (1 / settings.paths), 1)
+            self._follow(hit.ends, mi.UInt32(going), sampler, image)
+        radiance = list(image.radiance * (1 / settings.paths))
+        valid = dr.fmin(image.alpha * (1 / settings.paths), 1)
         if not settings.hide_lights and self._scene.environment() is not None:
-            behind.valid = dr.full(mi.Float, 1, count)  # as in Mitsuba's path tracer
-        dr.eval(behind.radiance, behind.valid)
-
-    def backward(self, ray: Any, sampler: Any, seen: Behind, gradients: list[Any]) -> None:
-        """There are no derivatives; the integrator says so."""
-        raise NotImplementedError
-
-    def forward(self, ray: Any, sampler: Any, seen: Behind) -> list[Any]:
-        """There are no derivatives; the integrator says so."""
-        raise NotImplementedError
+            valid = dr.full(mi.Float, 1, count)  # as in Mitsuba's path tracer
+        dr.eval(radiance, valid)
+        return Light(radiance, valid)
 
     def _behind_lights(self, ray: Any, pi: Any) -> tuple[Any, Any]:
         """The rays behind the light sources that they hit first, and what these meet."""
@@ -108,7 +108,7 @@ class PathsBehind(Backdrop):
             d=ends.ray.d,
             throughput=mi.Color3f(one),
             eta=one,
-            clear=one,
+            transmittance=one,
             vertex=ends.ray.o,
             pdf=one,
             delta=dr.full(mi.Bool, True, len(slot)),
@@ -135,11 +135,11 @@ class PathsBehind(Backdrop):
                 pdf = self._light.pdf(paths.vertex, paths.d)
                 weight = dr.select(paths.delta, 1, mis_weight(paths.pdf, pdf))
             image.add(paths.slot, paths.throughput * weight * seen.color)
-            image.cover(paths.slot, paths.clear * seen.opacity)
+            image.cover(paths.slot, paths.transmittance * seen.opacity)
             through = 1 - seen.opacity
             through = dr.select(through > dr.opaque(mi.Float, self._settings.stop), through, 0)
             paths.throughput *= through
-            paths.clear *= through
+            paths.transmittance *= through
             dr.eval(paths, image)
         return Ends(ray, pi)
 
@@ -155,7 +155,7 @@ class PathsBehind(Backdrop):
         bsdf = si.bsdf(ends.ray)
         image.add(paths.slot, self._emitted(si, paths, depth))
         if depth + 1 >= self._settings.max_depth:
-            image.cover(paths.slot, dr.select(si.is_valid(), paths.clear, 0))
+            image.cover(paths.slot, dr.select(si.is_valid(), paths.transmittance, 0))
             dr.eval(image)
             return paths, mi.Bool(False)
         active = si.is_valid() & (dr.max(paths.throughput) > 0)
@@ -163,7 +163,9 @@ class PathsBehind(Backdrop):
         from_emitters = self._to_emitters(si, bsdf, paths, chance, smooth)
         from_fields = self._to_fields(si, bsdf, paths, chance, smooth)
         following, going = self._turn(si, bsdf, paths, depth, chance, active)
-        image.cover(paths.slot, dr.select(si.is_valid(), paths.clear - following.clear, 0))
+        image.cover(
+            paths.slot, dr.select(si.is_valid(), paths.transmittance - following.transmittance, 0)
+        )
         dr.eval(image, from_emitters, from_fields, following, going)
         self._add_emitters(from_emitters, paths.slot, chance.jitter[0], image)
         self._add_fields(from_fields, paths.slot, chance.jitter[1], image)
@@ -228,7 +230,7 @@ class PathsBehind(Backdrop):
             d=ray.d,
             throughput=throughput,
             eta=eta,
-            clear=dr.select(straight, paths.clear, 0),
+            transmittance=dr.select(straight, paths.transmittance, 0),
             vertex=si.p,
             pdf=sample.pdf,
             delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),

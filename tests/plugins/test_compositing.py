@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import mi_nerf
+from mi_nerf.base.errors import InputError
 from mi_nerf.cameras.ndc import Ndc
 from tests.support.composed import (
     GLOW,
@@ -371,6 +372,11 @@ def test_normals_point_out_of_the_densest_place() -> None:
 # ---- Gradients ------------------------------------------------------------------
 
 
+def nested_dict(name: str) -> dict[str, Any]:
+    """A nested integrator of short paths."""
+    return {"type": name} | ({} if name.startswith("direct") else {"max_depth": 3})
+
+
 def interlocked(nested: str, file: Path) -> Any:
     """A network, two formulas and a wall through all of them, lit by a lamp.
 
@@ -383,7 +389,7 @@ def interlocked(nested: str, file: Path) -> Any:
     blob = formula_dict("gaussian", place().translate([0.2, 0.2, 0]), peak=2.0, width=0.3)
     return mi.load_dict(
         scene_of(
-            nerf({"type": nested, "max_depth": 3}, aovs="depth", paths=2),
+            nerf(nested_dict(nested), aovs="depth", paths=2),
             net={
                 "type": "cube",
                 "to_world": move,
@@ -451,6 +457,36 @@ CHANGES: dict[str, tuple[dict[str, Any], float, float]] = {
 @pytest.mark.parametrize("nested", ["path", "prb"])
 @pytest.mark.parametrize("kind", CHANGES)
 def test_gradients_agree_with_finite_differences(kind: str, nested: str, tmp_path: Path) -> None:
+    check_gradients(kind, nested, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "nested",
+    [
+        "prb_basic",
+        "prb_projective",
+        "direct",
+        "volpath",
+        "volpathmis",
+        "prbvolpath",
+    ],
+)
+@pytest.mark.parametrize("kind", ["surface", "all"])
+def test_gradients_through_every_nested_integrator(kind: str, nested: str, tmp_path: Path) -> None:
+    check_gradients(kind, nested, tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["surface", "weights", "all"])
+def test_gradients_pass_by_pass(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same where rays are traced in four passes, each with a seed of its own."""
+    from mi_nerf.plugins.film import FieldIntegrator
+
+    for limit in ("rays_per_pass", "rays_per_adjoint"):
+        monkeypatch.setattr(FieldIntegrator, limit, SIZE[0] * SIZE[1])
+    check_gradients(kind, "prb", tmp_path)
+
+
+def check_gradients(kind: str, nested: str, tmp_path: Path) -> None:
     """Of a weighted sum of all channels, along one number x, in both modes."""
     changes, step, tolerance = CHANGES[kind]
     file = small_file(tmp_path, density_activation="softplus")
@@ -482,6 +518,10 @@ def test_gradients_agree_with_finite_differences(kind: str, nested: str, tmp_pat
     assert float(dr.grad(x)[0]) == pytest.approx(expected, rel=tolerance)
     y = attached()
     loss = loss_at(y, params=params, seed_grad=7)
+    if nested == "prbvolpath":
+        with pytest.raises(InputError, match="'prbvolpath' has no derivatives in forward mode"):
+            dr.forward(y)
+        return
     dr.forward(y)
     assert float(dr.grad(loss).array[0]) == pytest.approx(float(dr.grad(x)[0]), rel=1e-3)
 
@@ -538,8 +578,10 @@ def test_media_of_other_kinds_are_refused() -> None:
 @pytest.mark.parametrize(
     ("nested", "message"),
     [
-        ({"type": "ptracer"}, "cannot look along single rays, expected one like 'path'"),
-        ({"type": "aov", "aovs": "z:depth"}, "has channels of its own"),
+        ({"type": "ptracer"}, "'ParticleTracerIntegrator', expected path, direct"),
+        ({"type": "aov", "aovs": "z:depth"}, "'AOVIntegrator', expected path, direct"),
+        ({"type": "direct_projective"}, "expected path, direct"),
+        ({"type": "depth"}, "'DepthIntegrator', expected path, direct"),
         ({"type": "nerf"}, "nested in 'nerf', expected one like 'path'"),
     ],
 )

@@ -1,0 +1,75 @@
+"""Fields of a scene with how they are sampled, and rays that are to be sampled so."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..base.arrays import gather_vector3
+from ..march.intervals import ray_segments
+from ..march.settings import MarchSettings
+from .placement import PlacedField
+
+
+@dataclass(frozen=True)
+class Marched:
+    """A field of the scene and how it is sampled."""
+
+    placed: PlacedField
+    march: MarchSettings  # without near and far
+    near: float | None  # along rays, world units; None: what the field file says
+    far: float | None
+    encoded: bool = False  # leave colours in the space in which they were composited
+
+    @property
+    def field(self) -> Any:
+        """The field."""
+        return self.placed.medium.field
+
+    def unbounded(self) -> Marched:
+        """The same field for rays that do not come from a camera: near and far are its."""
+        return replace(self, near=0.0, far=math.inf)
+
+    def bounds(self, reach: Any, scale: Any) -> tuple[Any, Any]:
+        """Bounds of t in field units: the integrator's or the file's, and ``reach``."""
+        march = self.placed.medium.march
+        near = mi.Float(march.near or 0) if self.near is None else self.near * scale
+        far = mi.Float(dr.inf if march.far is None else march.far)
+        if self.far is not None:
+            far = self.far * scale
+        return near, dr.fmin(far, reach * scale)
+
+    def hit(self, rays: Rays) -> Any:
+        """Which rays cross the box within their bounds."""
+        o, d, scale = self.placed.to_local(rays.o, rays.d)
+        dr.eval(o, d, scale)
+        return ray_segments(self.field, o, d, self.bounds(rays.reach, scale)).hit
+
+    @property
+    def differentiable(self) -> bool:
+        """Whether gradients of the field or its place are wanted."""
+        with dr.resume_grad():
+            weights = list(self.field.parameters().values())
+            return bool(dr.grad_enabled(weights)) or self.placed.moves
+
+
+@dataclass
+class Rays:
+    """R rays in the world, and how far along each fields are to be seen."""
+
+    o: Any
+    d: Any  # unit
+    reach: Any  # R distances: of a surface, or of the far clip plane
+    jitter: Any  # R numbers in [0, 1), or None
+
+    def take(self, index: Any) -> Rays:
+        """Some of them."""
+        o, d = gather_vector3(self.o, index), gather_vector3(self.d, index)
+        reach = dr.gather(mi.Float, self.reach, index)
+        jitter = None if self.jitter is None else dr.gather(mi.Float, self.jitter, index)
+        dr.eval(o, d, reach, jitter)
+        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter)
