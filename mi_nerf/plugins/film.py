@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 import drjit as dr
 import mitsuba as mi
-from mitsuba.ad.integrators.common import ADIntegrator
+from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from ..base.errors import InputError
 

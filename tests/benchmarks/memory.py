@@ -1,16 +1,20 @@
-"""Resident memory: over many training steps, and of one large frame through mi.render.
+"""Resident memory: over many training steps, of one large frame, and of derivatives.
 
     python -m tests.benchmarks.memory
 
 Prints resident megabytes every 200 of 2000 steps of the preset ``nerf``, the number of
 kernels compiled in the last 1000 of them, and the peak while Mitsuba renders 800x800
-pixels of the published 8x256 network with 16 samples a ray.
+pixels of the published 8x256 network with 16 samples a ray. Then the peak of
+``render_backward`` at 256x256, of a field before a wall under ``prb``, with 4, 16, 64 and 256
+samples a pixel, each in a process of its own.
 """
 
 from __future__ import annotations
 
 import argparse
 import resource
+import subprocess
+import sys
 import tempfile
 import time
 from pathlib import Path
@@ -37,6 +41,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=2000)
     parser.add_argument("--size", type=int, default=800)
     parser.add_argument("--samples", type=int, default=16)
+    parser.add_argument("--spp", type=int, nargs="*", default=[4, 16, 64, 256])
     parser.add_argument("--variant")
     options = parser.parse_args()
     variant = choose_variant(options.variant)
@@ -45,6 +50,11 @@ def main() -> None:
         _training(variant, options.steps)
     if options.size:
         _frame(variant, options.size, options.samples)
+    if len(options.spp) == 1:
+        _gradient(variant, options.spp[0])
+    for spp in options.spp if len(options.spp) > 1 else ():
+        command = [sys.executable, "-m", "tests.benchmarks.memory", "--steps", "0", "--size", "0"]
+        subprocess.run([*command, "--variant", variant, "--spp", str(spp)], check=True)
 
 
 def _training(variant: str, steps: int) -> None:
@@ -92,6 +102,35 @@ def _frame(variant: str, size: int, samples: int) -> None:
         f"{size}x{size}, {samples} samples a ray, 8x256: {time.perf_counter() - start:.0f} s, "
         f"peak {peak:.0f} MB resident ({before:.0f} MB before), "
         f"mean alpha {image[..., 3].mean():.2f}"
+    )
+
+
+def _gradient(variant: str, spp: int) -> None:
+    mi.set_variant(variant)
+    camera = Intrinsics.from_angle_x(256, 256, 0.6911)
+    wall = mi.ScalarTransform4f().translate([0, 1.5, 0]).rotate([1, 0, 0], 90).scale(3)
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "nerf", "samples": 16, "nested": {"type": "prb"}},
+            "sensor": sensor_dict(camera, look_at((0, -5, 0), (0, 0, 0))),
+            "wall": {"type": "rectangle", "to_world": wall},
+            "sky": {"type": "constant"},
+            "box": {"type": "cube", "interior": {"type": "nerfmedium", "field": "gaussian"}},
+        }
+    )
+    params = mi.traverse(scene)
+    key = "box.interior_medium.peak"
+    dr.enable_grad(params[key])
+    params.update()
+    start = time.perf_counter()
+    pull = dr.ones(mi.TensorXf, (256, 256, 4))
+    scene.integrator().render_backward(scene, params, pull, seed=1, spp=spp)
+    gradient = float(np.ravel(dr.grad(params[key]))[0])
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    print(
+        f"render_backward of 256x256 with {spp} samples a pixel: peak {peak:.0f} MB resident, "
+        f"{time.perf_counter() - start:.1f} s, gradient {gradient:.1f}"
     )
 
 
