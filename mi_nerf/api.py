@@ -7,6 +7,7 @@ Mitsuba variant holds if it is one that mi_nerf works with, otherwise the best o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -245,7 +246,7 @@ def render(
         source, active_variant(variant), path=path, frames=frames, size=size, spp=spp
     )
     result = []
-    with progress_bar("render", "frame", count, show=show) as bar:
+    with closing(images), progress_bar("render", "frame", count, show=show) as bar:
         for _, image in images:
             result.append(image)
             bar.update()

@@ -18,6 +18,7 @@ from ..base.errors import InputError
 from ..base.files import check_folder, make_folder, read_json, write_json
 from ..base.interrupts import interruptible
 from ..base.progress_bar import bars_are_seen, progress_bar
+from ..base.variants import using_variant
 from ..scene_xml.scene_file import SceneFile, visible_bounds
 from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View, make_plan, protocol_name
@@ -58,20 +59,18 @@ def generate(
     Raises:
         InputError: if anything is not as expected; existing files are as they were.
     """
-    import mitsuba as mi
-
     folder = Path(out)
     _check_output(folder, resume)
-    mi.set_variant(variant)
-    with _quiet():
-        file = SceneFile(scene, parameters)
-        tracer, plan = prepare(file, options or Options())
-    record = json.loads(json.dumps(_describe(file, plan, variant)))  # as it will be read
-    if resume and (folder / RECORD).exists():
-        record["views"] = _resumed_views(folder, record, plan)
-    if show:
-        print(plan, flush=True)
-    return _trace_views(folder, tracer, plan, record, show)
+    with using_variant(variant):
+        with _quiet():
+            file = SceneFile(scene, parameters)
+            tracer, plan = prepare(file, options or Options())
+        record = json.loads(json.dumps(_describe(file, plan, variant)))  # as it will be read
+        if resume and (folder / RECORD).exists():
+            record["views"] = _resumed_views(folder, record, plan)
+        if show:
+            print(plan, flush=True)
+        return _trace_views(folder, tracer, plan, record, show)
 
 
 def summary(record: dict[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -14,7 +14,7 @@ import numpy as np
 from ..base.color import srgb_to_linear
 from ..base.errors import InputError
 from ..base.files import check_file, check_folder, make_folder, replacing
-from ..base.variants import array_module
+from ..base.variants import array_module, using_variant
 from ..cameras.pinhole import Intrinsics
 from ..cameras.trajectory import Poses, forward_spiral, orbit_like, spiral_like
 from ..data import Dataset, held_out_split, load_dataset
@@ -25,7 +25,7 @@ from .target import Target, open_target
 
 Image = np.ndarray[Any, Any]
 Path_ = Literal["orbit", "spiral", "test"]
-Frames = Iterator[tuple[str, Image]]  # name and (H, W, 4) linear premultiplied RGBA
+Frames = Generator[tuple[str, Image], None, None]  # name and (H, W, 4) linear premultiplied RGBA
 
 Output = Literal["picture", "video", "folder"]
 
@@ -132,12 +132,32 @@ def scene_frames(
 ) -> tuple[int, Frames]:
     """Renders a Mitsuba scene: all of its sensors, or the first one moved along a path.
 
+    The variant is set until the frames are exhausted or closed.
+
     Raises:
         InputError: if the scene cannot be loaded or has no sensor.
     """
+
+    def produce() -> Generator[Any, None, None]:
+        with using_variant(variant):
+            count, images = _scene_frames(scene_path, path, frames, size, spp)
+            yield count
+            yield from images
+
+    produced = produce()
+    return next(produced), produced
+
+
+def _scene_frames(
+    scene_path: str | Path,
+    path: Path_ | None,
+    frames: int,
+    size: tuple[int, int] | None,
+    spp: int,
+) -> tuple[int, Frames]:
+    """As :func:`scene_frames`, with the active variant."""
     import mitsuba as mi
 
-    mi.set_variant(variant)
     scene = load_scene(scene_path)
     sensors = scene.sensors()
     if not sensors:
