@@ -378,7 +378,7 @@ def test_messages_of_the_error_page_are_those_of_the_code() -> None:
         for message in re.findall(r"`([^`]+)`", row):
             if message.startswith(mitsubas_own):
                 continue
-            pieces = re.split(r"…|'[^']*'|\d+|\w+\.json|^nerf\w*:|\.", message)
+            pieces = re.split(r"…|'[^']*'|--[\w-]+|\d+|\w+\.json|^nerf\w*:|\.", message)
             pieces = [piece.strip(" :,") for piece in pieces if len(piece.strip(" :,")) > 8]
             assert pieces, message
             for piece in pieces:
