@@ -19,6 +19,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from ._llvm import ensure_llvm
+from ._version import __version__ as __version__
 
 ensure_llvm()  # before Dr.Jit looks for its compiler
 
@@ -40,8 +41,6 @@ if TYPE_CHECKING:
     from .training.run import Run, TrainingError
 
 register_always()
-
-__version__ = "0.1.0"
 
 # Imported when first asked for: XML scenes need none of it.
 _LATER = {

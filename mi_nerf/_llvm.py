@@ -2,8 +2,9 @@
 
 Dr.Jit loads the library that ``DRJIT_LIBLLVM_PATH`` names when the first LLVM variant starts, which
 may be before anyone imports ``mi_nerf``. So a startup file, installed as ``mi_nerf.pth``, watches
-for the import of Dr.Jit and then runs :func:`ensure_llvm` from this file alone, without the package
-around it. Hence this file imports nothing but ``os`` and ``sys`` and loads no library.
+for the import of Dr.Jit and then, unless the variable is set, runs :func:`ensure_llvm` from this
+file alone, without the package around it. Hence this file imports nothing but ``os`` and ``sys``
+and loads no library. ``docs/how-it-works.md`` explains it to users.
 """
 
 import os

@@ -7,6 +7,7 @@ Mitsuba variant holds if it is one that mi_nerf works with, otherwise the best o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +16,7 @@ import mitsuba as mi
 
 from . import generation
 from .base.checks import positive, valid_seed
-from .base.errors import InputError
+from .base.errors import InputError, Option
 from .base.progress_bar import progress_bar
 from .base.variants import available_variants, choose_variant
 from .data import Dataset
@@ -157,7 +158,7 @@ def start(
     config = with_settings(config, assignments)
     for name, value in (("steps", steps), ("max_seconds", max_seconds)):
         if value is not None:
-            config = replace(config, **{name: positive(name.replace("_", "-"), value)})
+            config = replace(config, **{name: positive(name, value)})
     if not resume and config.steps is None and config.max_seconds is None:
         config = replace(config, max_seconds=600.0)
     if resume and (Path(out) / CONFIG).exists():
@@ -245,7 +246,7 @@ def render(
         source, active_variant(variant), path=path, frames=frames, size=size, spp=spp
     )
     result = []
-    with progress_bar("render", "frame", count, show=show) as bar:
+    with closing(images), progress_bar("render", "frame", count, show=show) as bar:
         for _, image in images:
             result.append(image)
             bar.update()
@@ -275,7 +276,7 @@ def _target(target: str | Path | Target | Run) -> Target:
 
 
 def _assignments(settings: Settings) -> list[str]:
-    """Settings as ``--set`` takes them."""
+    """Settings as ``key=value``."""
     if isinstance(settings, Mapping):
         return [f"{name}={as_text(value)}" for name, value in settings.items()]
     return list(settings)
@@ -292,6 +293,8 @@ def _require_same_settings(folder: Path, given: TrainConfig, assignments: list[s
     wanted = replace(wanted, steps=recorded.steps, max_seconds=recorded.max_seconds)
     if wanted != recorded:
         raise InputError(
-            f"{folder}: a resumed run keeps its settings, expected no other --preset, "
-            "--seed, --downscale or --set than it was started with"
+            "{}: a resumed run keeps its settings, expected no other {}, {}, {} or {} "
+            "than it was started with",
+            folder,
+            *map(Option, ("preset", "seed", "downscale", "settings")),
         )

@@ -15,6 +15,7 @@ import tyro
 
 from .base.errors import InputError
 from .commands import COMMANDS, command_type
+from .commands.shared import flag
 from .commands.usage import unknown_command, usage_error
 from .training.run import TrainingError
 
@@ -31,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         command = _parse(arguments)
         command.run(_process_start())
     except InputError as error:
-        return _fail(str(error), 2)
+        return _fail(error.told(flag), 2)
     except TrainingError as error:
         return _fail(str(error), 1)
     except OSError as error:

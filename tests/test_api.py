@@ -111,7 +111,7 @@ def test_settings_by_name_or_as_text(blob: Path, tmp_path: Path) -> None:
     assert mi_nerf.start(blob, tmp_path / "c", settings=SMALL).config.max_seconds == 600
     with pytest.raises(mi_nerf.InputError, match="unknown setting"):
         mi_nerf.start(blob, tmp_path / "d", settings={"network.widht": 16})
-    with pytest.raises(mi_nerf.InputError, match="--steps 0: expected a number above 0"):
+    with pytest.raises(mi_nerf.InputError, match="steps=0: expected a number above 0"):
         mi_nerf.start(blob, tmp_path / "d", steps=0)
     assert not (tmp_path / "d").exists()
 

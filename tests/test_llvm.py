@@ -194,6 +194,13 @@ def site(tmp_path):
 
 
 def start(site, code, **variables):
+    """What the code prints, as :func:`run` runs it; it says nothing else."""
+    found, errors = run(site, code, **variables)
+    assert errors == ""
+    return found
+
+
+def run(site, code, **variables):
     """Runs code in a new interpreter that has only ``site`` besides the standard library."""
     done = subprocess.run(
         [sys.executable, "-S", "-c", f"import site; site.addsitedir({str(site)!r}); {code}"],
@@ -204,8 +211,8 @@ def start(site, code, **variables):
         timeout=60,
         check=False,
     )
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout.strip()
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip(), done.stderr
 
 
 def without_choice():
@@ -236,13 +243,26 @@ def test_startup_leaves_a_chosen_llvm_alone(site):
     assert start(site, "import drjit; print(drjit.path)", **chosen) == "/chosen.so"
 
 
-@pytest.mark.parametrize("content", ["1 / 0", "syntax error", None])
-def test_startup_is_silent_when_it_fails(site, content):
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [("1 / 0", "ZeroDivisionError"), ("syntax error", "SyntaxError"), (None, "FileNotFoundError")],
+)
+def test_a_failing_startup_says_so_and_lets_drjit_start(site, content, said):
     file = site / "mi_nerf" / "_llvm.py"
     if content is None:
-        shutil.rmtree(file.parent)  # uninstalled by hand
+        file.unlink()
     else:
         file.write_text(content)
+    found, errors = run(site, "import drjit; print(drjit.path)")
+    assert found == "None"
+    assert "RuntimeWarning: mi_nerf.pth found no LLVM for Dr.Jit: " + said in errors
+    assert "Traceback" not in errors
+    # Who has chosen a library has switched it off.
+    assert start(site, "import drjit; print(drjit.path)", **{_llvm.VARIABLE: "/x.so"}) == "/x.so"
+
+
+def test_a_startup_file_without_its_package_does_nothing(site):
+    shutil.rmtree(site / "mi_nerf")
     assert start(site, "import drjit; print(drjit.path)") == "None"
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import drjit as dr
@@ -37,6 +39,24 @@ def choose_variant(requested: str | None = None) -> str:
             f"expected {' or '.join(available)}"
         )
     return requested or available[0]
+
+
+@contextmanager
+def using_variant(variant: str) -> Iterator[None]:
+    """Sets a Mitsuba variant, and at the end the one that was set before, if any was.
+
+    Inside a generator it lasts until that is exhausted or closed.
+    """
+    import mitsuba as mi
+
+    before = mi.variant()
+    if before != variant:  # even to the same one a change runs the callbacks of plugins
+        mi.set_variant(variant)
+    try:
+        yield
+    finally:
+        if before is not None and before != mi.variant():
+            mi.set_variant(before)
 
 
 def array_module(variant: str) -> Any:

@@ -58,7 +58,7 @@ class Ablate:
         config = replace(config, downscale=positive("downscale", self.downscale))
         if self.steps is None:
             seconds = 300.0 if self.max_seconds is None else self.max_seconds
-            config = replace(config, max_seconds=positive("max-seconds", seconds))
+            config = replace(config, max_seconds=positive("max_seconds", seconds))
         else:
             config = replace(config, steps=positive("steps", self.steps))
         if self.views is not None:

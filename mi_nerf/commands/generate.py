@@ -73,6 +73,7 @@ class Generate:
             resume=self.resume,
             variant=choose_variant(self.variant),
         )
-        print(f"{self.out}: {summary(record)}")
+        hint = "" if record["complete"] else ", go on with --resume"
+        print(f"{self.out}: {summary(record)}{hint}")
         if not record["complete"]:
             raise KeyboardInterrupt

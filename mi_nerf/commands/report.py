@@ -162,7 +162,7 @@ class Report:
             budget: dict[str, Any] = {"steps": positive("steps", self.steps)}
         else:
             seconds = 60.0 if self.max_seconds is None else self.max_seconds
-            budget = {"max_seconds": positive("max-seconds", seconds)}
+            budget = {"max_seconds": positive("max_seconds", seconds)}
         scale = positive("downscale", 1 if self.downscale is None else self.downscale)
         rows = {
             name: replace(config, seed=self.seed, downscale=scale, **budget)

@@ -7,14 +7,27 @@ from typing import Annotated
 from tyro.conf import arg
 
 from ..base.checks import positive, valid_seed
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.progress_bar import progress_bar
 
-__all__ = ["Variant", "name_and_value", "positive", "progress_bar", "valid_seed"]
+__all__ = ["Variant", "flag", "name_and_value", "positive", "progress_bar", "valid_seed"]
 
 Variant = Annotated[
     str | None, arg(help="Mitsuba variant; default: CUDA where it works, LLVM otherwise.")
 ]
+
+
+# Options that are not called as the arguments of functions that they become.
+_NAMES = {"parameters": "set", "points": "point", "settings": "set", "values": "set"}
+
+
+def flag(option: Option) -> str:
+    """An argument of a function as the command line writes it: ``--size 0 5``."""
+    name = "--" + _NAMES.get(option.name, option.name).replace("_", "-")
+    if option.value is None or option.value is True:
+        return name
+    values = option.value if isinstance(option.value, tuple) else (option.value,)
+    return " ".join([name, *(f"{v:g}" if isinstance(v, float) else str(v) for v in values)])
 
 
 def name_and_value(text: str, option: str = "--set") -> tuple[str, str]:

@@ -18,7 +18,7 @@ import drjit as dr
 import numpy as np
 
 from ..base.box import Corner, grid_shape
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.tensor_file import Arrays
 from ..base.variants import array_module
 from ..fields.fourier import Convention, FourierEncoding
@@ -301,7 +301,10 @@ def _find(checkpoint: Checkpoint, wanted: Which | None) -> tuple[_Layout, str]:
         which = wanted or ("fine" if "fine" in present else "coarse")
         if which not in present:
             raise InputError(
-                f"{checkpoint.path}: holds no {which} network, expected --network {present[0]}"
+                "{}: holds no {} network, expected {}",
+                checkpoint.path,
+                which,
+                Option("network", present[0]),
             )
         return layout, layout.keys[which]
     found = ", ".join(sorted(str(key) for key in checkpoint.content)[:5]) or "nothing"

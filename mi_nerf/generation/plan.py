@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..cameras.pinhole import Intrinsics
 from ..cameras.poses import look_at, opengl_from_mitsuba
 from ..scene_xml.scene_file import Bounds, SceneFile
@@ -142,7 +142,9 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
     if spp is None:
         spp = _sampler_spp(sensor) if file.plugins("Sampler") else _DEFAULT_SPP
     if spp < 2:
-        raise InputError(f"--spp {spp}: expected at least 2, of which the noise is estimated")
+        raise InputError(
+            "{}: expected at least 2, of which the noise is estimated", Option("spp", spp)
+        )
     up = _up_axis(options, sensor)
     if name == "forward":
         shots = _forward(file, scene, sensor, box, up, size, counts, options)
@@ -213,7 +215,7 @@ def _forward(
     """Cameras beside the scene's own, all looking the same way."""
     for option in ("cameras", "center"):
         if getattr(options, option) is not None:
-            raise InputError(f"--{option}: has no meaning for the protocol 'forward'")
+            raise InputError("{}: has no meaning for the protocol 'forward'", Option(option))
     pose, angle = _own_camera(sensor, box, up)
     intrinsics = Intrinsics.from_angle_x(*size, angle)
     spread = options.radius
@@ -246,14 +248,14 @@ def _center_and_radius(box: Bounds, options: Options) -> tuple[Array, float]:
     reach = 1.0 if fits else float(np.ptp(corners, axis=0).max()) / 2
     radius = RADIUS * reach if options.radius is None else options.radius
     if not np.isfinite(center).all():
-        raise InputError(f"--center {center.tolist()}: expected three finite numbers")
+        raise InputError("{}: expected three finite numbers", Option("center", options.center))
     _require_radius(radius)
     return center, radius
 
 
 def _require_radius(radius: float) -> None:
     if not 0 < radius < math.inf:
-        raise InputError(f"--radius {radius:g}: expected a number above 0")
+        raise InputError("{}: expected a number above 0", Option("radius", radius))
 
 
 def halves(spp: int) -> tuple[int, int]:
@@ -272,7 +274,7 @@ def _counts(name: str, options: Options) -> dict[str, int]:
         counts[split] = getattr(protocol, split) if given is None else given
         if counts[split] < (split == "train"):
             least = "at least 1" if split == "train" else "0 or more"
-            raise InputError(f"--{split} {counts[split]}: expected {least}")
+            raise InputError("{}: expected {}", Option(split, counts[split]), least)
     if name == "forward" and options.test is None and options.train is not None:
         # Every eighth of all: one in seven of the training views, rounded up.
         counts["test"] = -(-counts["train"] // (HOLD_OUT - 1))
@@ -281,7 +283,7 @@ def _counts(name: str, options: Options) -> dict[str, int]:
 
 def _size(size: tuple[int, int]) -> tuple[int, int]:
     if min(size) < 1:
-        raise InputError(f"--size {size[0]} {size[1]}: expected two numbers of at least 1")
+        raise InputError("{}: expected two numbers of at least 1", Option("size", size))
     return size
 
 

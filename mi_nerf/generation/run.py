@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from .._version import __version__
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.files import check_folder, make_folder, read_json, write_json
 from ..base.interrupts import interruptible
 from ..base.progress_bar import bars_are_seen, progress_bar
+from ..base.variants import using_variant
 from ..scene_xml.scene_file import SceneFile, visible_bounds
 from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View, make_plan, protocol_name
@@ -58,20 +59,18 @@ def generate(
     Raises:
         InputError: if anything is not as expected; existing files are as they were.
     """
-    import mitsuba as mi
-
     folder = Path(out)
     _check_output(folder, resume)
-    mi.set_variant(variant)
-    with _quiet():
-        file = SceneFile(scene, parameters)
-        tracer, plan = prepare(file, options or Options())
-    record = json.loads(json.dumps(_describe(file, plan, variant)))  # as it will be read
-    if resume and (folder / RECORD).exists():
-        record["views"] = _resumed_views(folder, record, plan)
-    if show:
-        print(plan, flush=True)
-    return _trace_views(folder, tracer, plan, record, show)
+    with using_variant(variant):
+        with _quiet():
+            file = SceneFile(scene, parameters)
+            tracer, plan = prepare(file, options or Options())
+        record = json.loads(json.dumps(_describe(file, plan, variant)))  # as it will be read
+        if resume and (folder / RECORD).exists():
+            record["views"] = _resumed_views(folder, record, plan)
+        if show:
+            print(plan, flush=True)
+        return _trace_views(folder, tracer, plan, record, show)
 
 
 def summary(record: dict[str, Any]) -> str:
@@ -79,7 +78,7 @@ def summary(record: dict[str, Any]) -> str:
     done, wanted = len(record["views"]), sum(record["settings"]["views"].values())
     size = "x".join(str(n) for n in record["settings"]["size"])
     if not record["complete"]:
-        return f"{done} of {wanted} views; interrupted, go on with --resume"
+        return f"{done} of {wanted} views; interrupted"
     known = ceilings(record)
     return f"{done} views of {size}, {f'PSNR ceiling {known}' if known else 'free of noise'}"
 
@@ -101,8 +100,10 @@ def _check_output(folder: Path, resume: bool) -> None:
     if not folder.exists() or not any(folder.iterdir()):
         return
     if not resume:
-        hint = ", or --resume" if (folder / RECORD).exists() else ""
-        raise InputError(f"{folder}: holds files already, expected a new or empty folder{hint}")
+        message = "{}: holds files already, expected a new or empty folder"
+        if (folder / RECORD).exists():
+            raise InputError(message + ", or {}", folder, Option("resume", True))
+        raise InputError(message, folder)
     if not (folder / RECORD).exists():
         raise InputError(f"{folder}: holds no {RECORD}, expected a dataset begun by generate")
 
@@ -152,8 +153,11 @@ def _check_sampler(sampler: Any, plan: Plan) -> None:
         sampler.set_sample_count(count)
         if sampler.sample_count() != count:
             raise InputError(
-                f"--spp {plan.spp}: the scene's sampler '{sampler.class_name()}' cannot take "
-                f"half of them, {count}, expected e.g. {2 * sampler.sample_count()}"
+                "{}: the scene's sampler '{}' cannot take half of them, {}, expected e.g. {}",
+                Option("spp", plan.spp),
+                sampler.class_name(),
+                count,
+                2 * sampler.sample_count(),
             )
 
 

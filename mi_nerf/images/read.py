@@ -8,6 +8,7 @@ of straight colours lets invisible pixels bleed into visible ones (Porter & Duff
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -23,6 +24,17 @@ from ..base.color import ColorSpace
 from ..base.errors import InputError
 
 IMAGE_SUFFIXES = {".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
+
+# What Pillow and OpenEXR raise for damaged files. Others are faults of the program.
+_DAMAGE = (
+    OSError,
+    EOFError,
+    SyntaxError,
+    ValueError,
+    RuntimeError,
+    struct.error,
+    Image.DecompressionBombError,
+)
 
 # Called as progress(done, total), always from the thread that asked for the images.
 Progress = Callable[[int, int], None]
@@ -207,8 +219,6 @@ def _corruption_as_input_error(path: Path) -> Iterator[None]:
     """Decoders raise exceptions of many types for damaged files; users see one."""
     try:
         yield
-    except MemoryError:
-        raise
-    except Exception as error:
+    except _DAMAGE as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"{path}: corrupt or unreadable image ({reason})") from error

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.files import make_folder, read_json, replacing, write_json
 from ..base.machine import machine
 from ..data import held_out_split, load_dataset
@@ -44,11 +44,11 @@ def rows_of(
     """
     for key, values in vary.items():
         if not values:
-            raise InputError(f"--vary {key}: expected key=value,value,...")
+            raise InputError("{}: expected at least one value", Option("vary", key))
         if key not in setting_names():
             with_settings(preset("nerf"), [f"{key}={values[0]}"])  # says what may be meant
     if not presets:
-        raise InputError("--presets: nothing to train, expected at least one")
+        raise InputError("{}: nothing to train, expected at least one", Option("presets"))
     rows = {}
     for name in presets:
         base = with_settings(preset(name), list(settings))
@@ -97,10 +97,12 @@ def training_curves(
     """
     for name, value in (("seeds", seeds), ("views", views), ("looks", looks)):
         if value < 1:
-            raise InputError(f"--{name} {value}: expected at least 1")
+            raise InputError("{}: expected at least 1", Option(name, value))
     split = split or held_out_split(data)
     if split is None:
-        raise InputError(f"{data}: has training views alone, expected --split train")
+        raise InputError(
+            "{}: has training views alone, expected {}", data, Option("split", "train")
+        )
     load_dataset(data, split, limit=1)  # before hours of work
     folder = Path(out)
     settings = {

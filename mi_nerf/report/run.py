@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.files import check_folder, make_folder, read_json, replacing, write_json
 from ..base.machine import machine
 from ..data import load_dataset
@@ -156,8 +156,10 @@ def _places(
         place = field_position(field, np.array(point, np.float64)[:, None])[:, 0]
         if not (np.array(field.lower) <= place).all() or not (place <= field.upper).all():
             raise InputError(
-                f"--point {' '.join(map(str, point))}: outside the field's box "
-                f"{field.lower} to {field.upper}"
+                "{}: outside the field's box {} to {}",
+                Option("points", tuple(point)),
+                field.lower,
+                field.upper,
             )
         surface_normal(field, point, subject.backend)  # there is one
     if len(points):

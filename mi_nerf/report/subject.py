@@ -14,7 +14,7 @@ import numpy as np
 
 from ..base.arrays import upload, vector3_type
 from ..base.color import linear_to_srgb
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.variants import array_module
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from ..cameras.trajectory import orbit
@@ -133,7 +133,7 @@ def open_subject(
     """
     for name, value in (("rays", rays), ("views", views)):
         if value < 1:
-            raise InputError(f"--{name} {value}: expected at least 1")
+            raise InputError("{}: expected at least 1", Option(name, value))
     opened = _opened(target)
     subject = open_field(opened, variant, values=values)
     if isinstance(opened, str):
@@ -157,7 +157,7 @@ def open_field(
         formula = _formula(opened, values or {}, backend)
         return Subject(opened, True, formula, None, MarchSettings(), backend, variant)
     if values:
-        raise InputError(f"--set {next(iter(values))}: {opened.path} is no formula")
+        raise InputError("{}: {} is no formula", Option("values", next(iter(values))), opened.path)
     field, occupancy = opened.contents.build(backend)
     return Subject(
         str(opened.path), False, field, occupancy, opened.contents.march, backend, variant
@@ -207,7 +207,9 @@ def _cameras(
         return _around(field, views)
     split = split or held_out_split(folder)
     if split is None:
-        raise InputError(f"{folder}: has training views alone, expected --split train")
+        raise InputError(
+            "{}: has training views alone, expected {}", folder, Option("split", "train")
+        )
     images = held_out(target, data, split, downscale, views)
     truth = np.stack([reference_image(images, k) for k in range(len(images))])
     origin = {"data": str(folder), "split": images.split}
@@ -217,7 +219,9 @@ def _cameras(
 def _around(field: Field, views: int) -> _Cameras:
     """Cameras on a circle that see the whole box."""
     if field.ndc is not None:
-        raise InputError("a field for forward-facing cameras, expected --data with their views")
+        raise InputError(
+            "a field for forward-facing cameras, expected {} with their views", Option("data")
+        )
     lower, upper = np.array(field.lower, float), np.array(field.upper, float)
     radius = float(np.linalg.norm(upper - lower)) / 2 / math.sin(_ANGLE / 2)
     poses = orbit((lower + upper) / 2, np.array([0.0, 0, 1]), radius, _HEIGHT, views)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..base.color import linear_to_srgb
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.files import replacing
 from ..base.variants import array_module
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
@@ -109,7 +109,9 @@ def find_points(
     origin, direction = (np.array(v).reshape(3, -1).T[opaque] for v in (o, d))
     points = origin + np.array(seen.depth)[opaque, None] * direction
     if len(points) < count:
-        raise InputError("the cameras see no surface, expected --point with its position")
+        raise InputError(
+            "the cameras see no surface, expected {} with its position", Option("points")
+        )
     chosen = [0]
     while len(chosen) < count:  # each as far as possible from those before
         distance = np.linalg.norm(points[:, None] - points[chosen], axis=-1).min(axis=1)

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import re
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from ..base.errors import InputError
 from .instancing import copy_instances
+
+_ASKED = "mi_nerf_asked"  # the id of a shape in a scene that is parsed, never loaded
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -34,19 +36,29 @@ class SceneFile:
         if not self.path.is_file():
             raise InputError(f"{path}: not found, expected a Mitsuba XML scene")
         self._config = mi.parser.ParserConfig(mi.variant())
-        with self._one_line_errors():
+        with self._one_line_errors(), self._beside_the_file():
             self._state = mi.parser.parse_file(self._config, str(self.path), **self.parameters)
         if self._state.root.type != mi.ObjectType.Scene:
             raise InputError(f"{path}: expected <scene> as the outermost element")
 
     def default(self, name: str) -> str | None:
         """The value of a ``$parameter``: as given, or by the file's own ``<default>``."""
+        import mitsuba as mi
+
         if name in self.parameters:
             return self.parameters[name]
-        for element in ElementTree.parse(self.path).getroot().iter("default"):
-            if element.get("name") == name:
-                return element.get("value")
-        return None
+        # Mitsuba's parser takes much that is no XML, and does not tell defaults: it is asked what
+        # it puts for the parameter in a scene that includes the file. The first default counts.
+        asking = (
+            f'<scene version="3.0.0"><include filename={quoteattr(self.path.name)}/>'
+            f'<default name="{name}" value=""/>'
+            f'<shape type="cube" id="{_ASKED}"><string name="value" value="${name}"/></shape>'
+            "</scene>"
+        )
+        with self._one_line_errors(), self._beside_the_file():
+            state = mi.parser.parse_string(self._config, asking, **self.parameters)
+        shape = state.nodes[state.id_to_index[_ASKED]].props
+        return str(shape["value"]) or None
 
     def plugins(self, kind: str) -> list[Any]:
         """The properties of all plugins of a kind, such as ``"Sensor"``."""
@@ -93,13 +105,13 @@ class SceneFile:
 
     @contextmanager
     def _one_line_errors(self) -> Iterator[None]:
-        """Says in one line what Mitsuba refuses."""
+        """Says in one line what Mitsuba refuses; a fault of a Python plugin comes as it is."""
         try:
             yield
-        except InputError:
-            raise
-        except Exception as error:  # Mitsuba raises RuntimeError for all that can be wrong
-            message = _without_traceback(str(error))
+        except RuntimeError as error:  # for all that can be wrong, what plugins raise included
+            message = _refusal(str(error))
+            if message is None:
+                raise
             raise InputError(f"{self.path}: Mitsuba cannot load this scene: {message}") from error
 
     @contextmanager
@@ -143,10 +155,16 @@ def visible_bounds(scene: Any) -> Bounds | None:
     return tuple(lower.tolist()), tuple(upper.tolist())
 
 
-def _without_traceback(message: str) -> str:
-    """One line: of a Python plugin's traceback in it, only what the exception says."""
+def _refusal(message: str) -> str | None:
+    """What Mitsuba says, in one line; None if a Python plugin failed by a fault of its own.
+
+    An exception of a plugin comes as the text of its traceback. Plugins of mi_nerf refuse by
+    InputError, those of Mitsuba and others by a plain Exception.
+    """
     before, found, traceback = message.partition("Traceback (most recent call last):")
     if found:
-        said = re.findall(r"^[\w.]*(?:Error|Exception): (.*)", traceback, re.MULTILINE)
-        message = before + (said[-1] if said else traceback)
+        said = re.search(r"^(?:[\w.]+\.)?(\w+): (.*)", traceback, re.MULTILINE | re.DOTALL)
+        if said is None or said[1] not in ("InputError", "Exception", "RuntimeError"):
+            return None
+        message = before + said[2]
     return " ".join(message.split())

@@ -16,7 +16,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from ..base.color import linear_to_srgb
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.files import make_folder, replacing
 from ..base.variants import array_module
 from ..data import Dataset, load_dataset
@@ -126,15 +126,19 @@ def held_out(
         InputError: if there are none, or they are not of the kind it was trained on.
     """
     if views is not None and views < 1:
-        raise InputError(f"--views {views}: expected at least 1")
+        raise InputError("{}: expected at least 1", Option("views", views))
     scale = target.downscale if downscale is None else downscale
     if scale < 1:
-        raise InputError(f"--downscale {scale}: expected at least 1")
+        raise InputError("{}: expected at least 1", Option("downscale", scale))
     path = Path(data) if data is not None else target.data
     if path is None:
-        raise InputError(f"{target.path}: a field file knows no dataset, expected --data too")
+        raise InputError(
+            "{}: a field file knows no dataset, expected {} too", target.path, Option("data")
+        )
     if data is None and not path.exists():
-        raise InputError(f"{path}: the dataset of {target.path} is gone, expected --data")
+        raise InputError(
+            "{}: the dataset of {} is gone, expected {}", path, target.path, Option("data")
+        )
     dataset = load_dataset(path, split, downscale=scale, limit=views)
     _require_same_projection(target, dataset)
     return dataset

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -12,9 +12,9 @@ import imageio.v2 as imageio
 import numpy as np
 
 from ..base.color import srgb_to_linear
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.files import check_file, check_folder, make_folder, replacing
-from ..base.variants import array_module
+from ..base.variants import array_module, using_variant
 from ..cameras.pinhole import Intrinsics
 from ..cameras.trajectory import Poses, forward_spiral, orbit_like, spiral_like
 from ..data import Dataset, held_out_split, load_dataset
@@ -25,7 +25,9 @@ from .target import Target, open_target
 
 Image = np.ndarray[Any, Any]
 Path_ = Literal["orbit", "spiral", "test"]
-Frames = Iterator[tuple[str, Image]]  # name and (H, W, 4) linear premultiplied RGBA
+Frames = Generator[tuple[str, Image], None, None]  # name and (H, W, 4) linear premultiplied RGBA
+
+_MOVING = (Option("path", "orbit"), Option("path", "spiral"))
 
 Output = Literal["picture", "video", "folder"]
 
@@ -63,8 +65,9 @@ def frames_of(
         if source.suffix.lower() == ".xml":
             if frames is not None and path is None:
                 raise InputError(
-                    f"--frames {frames}: the sensors of a scene give one frame each, "
-                    "expected --path orbit or --path spiral too"
+                    "{}: the sensors of a scene give one frame each, expected {} or {} too",
+                    Option("frames", frames),
+                    *_MOVING,
                 )
             return scene_frames(
                 source,
@@ -132,12 +135,32 @@ def scene_frames(
 ) -> tuple[int, Frames]:
     """Renders a Mitsuba scene: all of its sensors, or the first one moved along a path.
 
+    The variant is set until the frames are exhausted or closed.
+
     Raises:
         InputError: if the scene cannot be loaded or has no sensor.
     """
+
+    def produce() -> Generator[Any, None, None]:
+        with using_variant(variant):
+            count, images = _scene_frames(scene_path, path, frames, size, spp)
+            yield count
+            yield from images
+
+    produced = produce()
+    return next(produced), produced
+
+
+def _scene_frames(
+    scene_path: str | Path,
+    path: Path_ | None,
+    frames: int,
+    size: tuple[int, int] | None,
+    spp: int,
+) -> tuple[int, Frames]:
+    """As :func:`scene_frames`, with the active variant."""
     import mitsuba as mi
 
-    mi.set_variant(variant)
     scene = load_scene(scene_path)
     sensors = scene.sensors()
     if not sensors:
@@ -163,9 +186,7 @@ def scene_frames(
     if path is None:
         return len(sensors), still()
     if path == "test":
-        raise InputError(
-            f"{scene_path}: a scene has no test views, expected --path orbit or spiral"
-        )
+        raise InputError("{}: a scene has no test views, expected {} or {}", scene_path, *_MOVING)
     return frames, _moving(scene, sensors[0], path, frames, render)
 
 
@@ -251,7 +272,7 @@ def _cameras(target: Target, path: Path_) -> Dataset:
         return load_dataset(target.data, "train", downscale=target.downscale)
     split = held_out_split(target.data)
     if split is None:
-        raise InputError(f"{target.data}: has no test views, expected --path orbit or spiral")
+        raise InputError("{}: has no test views, expected {} or {}", target.data, *_MOVING)
     return load_dataset(target.data, split, downscale=target.downscale)
 
 
@@ -269,8 +290,10 @@ def _path_poses(target: Target, dataset: Dataset, path: Path_, frames: int) -> P
         return (orbit_like if path == "orbit" else spiral_like)(poses, frames)
     if path == "orbit":
         raise InputError(
-            f"{target.path}: trained on a forward-facing capture, "
-            "expected --path spiral or --path test"
+            "{}: trained on a forward-facing capture, expected {} or {}",
+            target.path,
+            Option("path", "spiral"),
+            Option("path", "test"),
         )
     assert dataset.near is not None and dataset.far is not None  # LLFF always says so
     return forward_spiral(poses, dataset.near, dataset.far, frames)
@@ -281,7 +304,7 @@ def _resized(intrinsics: Intrinsics, size: tuple[int, int] | None) -> Intrinsics
     if size is None:
         return intrinsics
     if min(size) < 1:
-        raise InputError(f"--size {size[0]} {size[1]}: expected two numbers of at least 1")
+        raise InputError("{}: expected two numbers of at least 1", Option("size", size))
     scale = size[0] / intrinsics.width
     return replace(
         intrinsics,

@@ -9,9 +9,12 @@ import drjit as dr
 import numpy as np
 
 from ..base.arrays import gather_vector3
+from ..base.errors import InputError, Option
 from ..base.kernel_stages import stage
 from ..cameras.pinhole import pack_poses, pixel_rays
 from ..data import Dataset
+
+MOST_VALUES = 1 << 32  # which an index of 32 bits cannot tell apart any more
 
 
 @dataclass
@@ -51,7 +54,12 @@ class RaySource:
     """Keeps a dataset's pixels and poses on the device and draws random rays."""
 
     def __init__(self, dataset: Dataset, background: str, float_type: Any) -> None:
-        """``background`` is 'white', 'black' or 'random' (a new colour for every ray)."""
+        """``background`` is 'white', 'black' or 'random' (a new colour for every ray).
+
+        Raises:
+            InputError: for more values of pixels than 32 bits can number.
+        """
+        _require_indices(dataset)
         self._float, self._uint = float_type, dr.uint32_array_t(float_type)
         self._intrinsics = dataset.intrinsics
         self._pixels = float_type(dataset.images.reshape(-1))
@@ -86,6 +94,22 @@ class RaySource:
             return [rng.random(self._float, rays) for _ in range(3)]
         value = 1.0 if self._background == "white" else 0.0
         return [dr.opaque(self._float, value) for _ in range(3)]
+
+
+def _require_indices(dataset: Dataset) -> None:
+    """Refuses more values than there are indices, before Dr.Jit does it without advice."""
+    size, count = dataset.intrinsics, dataset.images.size
+    if count >= MOST_VALUES:
+        raise InputError(
+            "{}: {} views of {}x{} hold {} values, expected less than {} by a larger {}",
+            dataset.path,
+            len(dataset),
+            size.width,
+            size.height,
+            count,
+            MOST_VALUES,
+            Option("downscale"),
+        )
 
 
 def blank_loss(dataset: Dataset, background: str) -> float:

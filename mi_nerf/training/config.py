@@ -8,7 +8,7 @@ import json
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..fields.activations import ColorActivation, DensityActivation
 from ..fields.fourier import FourierEncoding
 from ..fields.fused_network import WIDEST
@@ -181,27 +181,30 @@ def with_settings(config: TrainConfig, assignments: list[str]) -> TrainConfig:
     """
     values = dataclasses.asdict(config)
     for assignment in assignments:
+        option = Option("settings", assignment)
         key, separator, text = assignment.partition("=")
         if not separator:
-            raise InputError(f"--set {assignment}: expected key=value")
+            raise InputError("{}: expected key=value", option)
         if key == "preset":  # would change the name and nothing else
-            raise InputError(f"--set {assignment}: expected --preset {text}")
+            raise InputError("{}: expected {}", option, Option("preset", text))
         try:
             assign(values, TrainConfig, key.split("."), text)
         except KeyError:
-            raise InputError(f"--set {assignment}: unknown setting, {_similar(key)}") from None
+            raise InputError("{}: unknown setting, {}", option, _similar(key)) from None
         except ValueError as error:
-            raise InputError(f"--set {assignment}: {error}") from None
+            raise InputError("{}: {}", option, error) from None
     try:
         result: TrainConfig = build(TrainConfig, values)
     except ValueError as error:
         names = [a for a in assignments if f"{a.partition('=')[0].split('.')[-1]}=" in str(error)]
-        raise InputError(f"--set {' '.join(names or assignments)}: {error}") from error
+        raise InputError(
+            "{}: {}", Option("settings", " ".join(names or assignments)), error
+        ) from error
     return result
 
 
 def setting_names() -> list[str]:
-    """All keys that ``--set`` accepts."""
+    """All keys of assignments."""
     return [name for name in leaf_names(TrainConfig) if name != "preset"]
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._version import __version__
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..base.files import check_folder, make_folder, write_json
 from ..base.interrupts import interruptible
 from ..base.variants import array_module
@@ -365,7 +365,8 @@ def start(
     elif resume and (folder / CHECKPOINT).exists():
         raise InputError(f"{folder}: no {CONFIG} beside the {CHECKPOINT}, expected both")
     elif (folder / CONFIG).exists() or (folder / CHECKPOINT).exists():
-        raise InputError(f"{folder}: already holds a run, expected --resume or another folder")
+        resuming = Option("resume", True)
+        raise InputError("{}: already holds a run, expected {} or another folder", folder, resuming)
     check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
     choice = Choice(config, [])

@@ -129,7 +129,7 @@ LONG = "/a/very/long/path/that/fits/in/no/line/of/a/terminal/of/eighty/columns/a
         ("render {run} -o {out} --path None", "--path None: expected one of orbit, spiral, test"),
         # ---- Values out of range ----
         ("train {data} --out {out} --steps 0", "--steps 0: expected a number above 0"),
-        ("train {data} --out {out} --max-seconds -1", "--max-seconds -1.0: expected a number"),
+        ("train {data} --out {out} --max-seconds -1", "--max-seconds -1: expected a number"),
         ("train {data} --out {out} --max-seconds nan", "--max-seconds nan: expected a number"),
         ("train {data} --out {out} --max-seconds inf", "--max-seconds inf: expected a number"),
         ("train {data} --out {out} --downscale 0", "--downscale 0: expected a number above 0"),
@@ -145,7 +145,7 @@ LONG = "/a/very/long/path/that/fits/in/no/line/of/a/terminal/of/eighty/columns/a
         ("render {run} -o {out}.png --size 0 10", "--size 0 10: expected two numbers of at least"),
         ("render {run} -o {out}.png --frames 0", "--frames 0: expected a number above 0"),
         ("render {run} -o {out}.png --spp -1", "--spp -1: expected a number above 0"),
-        ("demo --out {out} --seconds 0", "--seconds 0.0: expected a number above 0"),
+        ("demo --out {out} --seconds 0", "--seconds 0: expected a number above 0"),
         ("demo --out {out} --seed -1", "--seed -1: expected a number from 0 to"),
         # ---- --set ----
         ("train {data} --out {out} --set", "--set: expected a value"),
@@ -635,7 +635,7 @@ def test_frames_of_a_scene_need_a_path(refused: Refused, blob_run: Path, tmp_pat
     message = refused("render", scene, "-o", tmp_path / "new", "--frames", "3")
     assert "--frames 3: the sensors of a scene give one frame each, expected --path" in message
     message = refused("render", scene, "-o", tmp_path / "new", "--path", "test")
-    assert f"{scene}: a scene has no test views, expected --path orbit or spiral" in message
+    assert f"{scene}: a scene has no test views, expected --path orbit or --path spiral" in message
 
 
 # --------------------------------------------------------------------------

@@ -341,7 +341,7 @@ def test_resume_refuses_another_dataset(tmp_path: Path) -> None:
     scene.write_text(scene.read_text().replace("0.7, 0.4, 0.2", "0.7, 0.4, 0.3"))
     with pytest.raises(InputError, match="another dataset: scene.sha256"):
         make(scene, out, resume=True)
-    with pytest.raises(InputError, match="expected a new or empty folder, or --resume"):
+    with pytest.raises(InputError, match="expected a new or empty folder, or resume=True"):
         make(scene, out)
     assert contents(out) == before
 

@@ -102,7 +102,7 @@ def test_points_lie_on_what_cameras_see() -> None:
     apart = np.linalg.norm(points[:, None] - points, axis=-1) + 9 * np.eye(4)
     assert apart.min() > 0.4
     empty = AnalyticField(ball(0.5, 0.0))
-    with pytest.raises(InputError, match="expected --point"):
+    with pytest.raises(InputError, match="expected points"):
         find_points(empty, None, camera, orbit_poses(6), march, BACKEND)
 
 
@@ -183,6 +183,6 @@ def test_a_run_whose_data_is_gone(
 def test_bad_input(refused: Callable[..., str], run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     line = refused("report", run, "--out", out, "--point", "9", "0", "0")
-    assert "--point 9.0 0.0 0.0: outside the field's box" in line
+    assert "--point 9 0 0: outside the field's box" in line
     line = refused("report", run, "--out", out, "--point", "9", "0", "0", "--no-speed")
     assert "outside the field's box" in line

@@ -136,28 +136,28 @@ def test_names_cover_the_configuration() -> None:
 @pytest.mark.parametrize(
     ("assignments", "said"),
     [
-        ("network.width", "--set network.width: expected key=value"),
-        ("=3", "--set =3: unknown setting"),
-        ("network=3", "--set network=3: unknown setting, expected for example network."),
+        ("network.width", "settings='network.width': expected key=value"),
+        ("=3", "settings='=3': unknown setting"),
+        ("network=3", "settings='network=3': unknown setting, expected for example network."),
         ("network.width.x=3", "unknown setting, expected for example network.width"),
         ("network.widht=3", "unknown setting, expected for example network.width"),
         ("width=3", "unknown setting, expected for example network.width"),
-        ("preset=paper", "--set preset=paper: expected --preset paper"),
-        ("network.width=", "--set network.width=: expected a whole number"),
-        ("network.width=1e2", "--set network.width=1e2: expected a whole number"),
-        ("network.width=none", "--set network.width=none: expected a whole number"),
-        ("steps=soon", "--set steps=soon: expected a whole number or none"),
-        ("optimizer.lr=fast", "--set optimizer.lr=fast: expected a number"),
-        ("optimizer.lr=nan", "--set optimizer.lr=nan: expected a number"),
-        ("optimizer.lr=inf", "--set optimizer.lr=inf: expected a number"),
-        ("occupancy.hull=maybe", "--set occupancy.hull=maybe: expected true or false"),
-        ("occupancy.hull=2", "--set occupancy.hull=2: expected true or false"),
-        ("loss=l1", "--set loss=l1: expected one of auto, mse, relative"),
+        ("preset=paper", "settings='preset=paper': expected preset='paper'"),
+        ("network.width=", "settings='network.width=': expected a whole number"),
+        ("network.width=1e2", "settings='network.width=1e2': expected a whole number"),
+        ("network.width=none", "settings='network.width=none': expected a whole number"),
+        ("steps=soon", "settings='steps=soon': expected a whole number or none"),
+        ("optimizer.lr=fast", "settings='optimizer.lr=fast': expected a number"),
+        ("optimizer.lr=nan", "settings='optimizer.lr=nan': expected a number"),
+        ("optimizer.lr=inf", "settings='optimizer.lr=inf': expected a number"),
+        ("occupancy.hull=maybe", "settings='occupancy.hull=maybe': expected true or false"),
+        ("occupancy.hull=2", "settings='occupancy.hull=2': expected true or false"),
+        ("loss=l1", "settings='loss=l1': expected one of auto, mse, relative"),
         ("color_activation=x", "expected one of auto, sigmoid, softplus, exp"),
-        ("box=1,2", "--set box=1,2: expected 6 numbers separated by commas or none"),
+        ("box=1,2", "settings='box=1,2': expected 6 numbers separated by commas or none"),
         ("box=0,0,0,1,nan,1", "expected 6 numbers separated by commas or none"),
         ("box=0,0,0,1,-1,1", "expected three minima below three maxima"),
-        ("network.width=0", "--set network.width=0: network: width=0, expected at least 1"),
+        ("network.width=0", "settings='network.width=0': network: width=0, expected at least 1"),
         ("network.skip=9", "skip=9, expected -1 (none) or a layer from 1 to depth-1"),
         ("position.frequencies=25", "frequencies=25, expected 0 to 24"),
         ("seed=-1", "seed=-1, expected a number of at least 0 and below 2147483648"),
@@ -176,7 +176,7 @@ def test_names_cover_the_configuration() -> None:
         ("density.gain=-1", "gain=-1.0, expected a number above 0"),
         (
             "sampling.near=3 seed=1 sampling.far=2",
-            "--set sampling.near=3 sampling.far=2: near=3.0, expected less than far=2.0",
+            "settings='sampling.near=3 sampling.far=2': near=3.0, expected less than far=2.0",
         ),
     ],
 )
@@ -184,7 +184,7 @@ def test_refusals(assignments: str, said: str) -> None:
     with pytest.raises(InputError) as refusal:
         with_settings(TrainConfig(), assignments.split())
     message = str(refusal.value)
-    assert message.startswith("--set ") and said in message
+    assert message.startswith("settings='") and said in message
     assert "\n" not in message
 
 

@@ -270,7 +270,7 @@ def test_a_run_folder_holds_what_it_should(data: Path, tmp_path: Path) -> None:
 def test_an_existing_run_is_not_overwritten(data: Path, tmp_path: Path) -> None:
     training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb").train(show_bar=False)
     before = (tmp_path / "run/checkpoint.safetensors").read_bytes()
-    with pytest.raises(InputError, match="already holds a run, expected --resume"):
+    with pytest.raises(InputError, match="already holds a run, expected resume=True"):
         training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb")
     assert (tmp_path / "run/checkpoint.safetensors").read_bytes() == before
 
