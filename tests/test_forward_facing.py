@@ -24,8 +24,9 @@ from mi_nerf.cameras.trajectory import forward_spiral
 from mi_nerf.cli import main
 from mi_nerf.data import hull, load_dataset
 from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate, render_rays
+from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.march.view import render_view
 from mi_nerf.training.config import TrainConfig

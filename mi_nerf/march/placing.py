@@ -11,13 +11,11 @@ from ..fields.protocol import Field
 from .importance import inverse_transform, merge_sorted
 from .intervals import ray_segments
 from .occupancy import OccupancyGrid
-from .quadrature import sample_weights
-from .query import (
-    Evaluation,
-)
+from .query import Evaluation
+from .rules import RULES, sample_weights
 from .samples import Samples
 from .settings import MarchSettings
-from .strata import cell_widths, points_along, stratified
+from .strata import cell_widths, points_along
 
 
 def place_samples(
@@ -39,14 +37,9 @@ def place_samples(
     with dr.suspend_grad():
         within = ray_segments(field, o, d, (settings.near, settings.far), bounds or (None, None))
         o, d, near, far = within.o, within.d, within.near, within.far
-        t, delta = stratified(near, far, settings.samples, jitter)
-        even = settings.rule == "constant"
-        if not even:
-            delta = cell_widths(t, near, far, settings.samples)
-        count, rule, ndc = settings.samples, settings.rule, within.ndc
-        samples = Samples(
-            o, d, within.view, t, delta, count, near, far, ndc=ndc, rule=rule, even=even
-        )
+        rule, count = RULES[settings.rule], settings.samples
+        t, delta = rule.place(near, far, count, jitter)
+        samples = Samples(o, d, within.view, t, delta, count, near, far, ndc=within.ndc, rule=rule)
         samples = _select(samples, within.hit, occupancy, settings.hidden)
         coarse = getattr(field, "coarse", None)
         if coarse is None or not settings.fine:
@@ -86,7 +79,7 @@ def refine(
             delta=delta,
             count=count + fine,
             coarse_queries=samples.queries,
-            even=False,
+            rule=samples.rule.refined,
         )
         return _select(merged, far > near, occupancy, hidden)
 

@@ -13,7 +13,7 @@ block, which is what bounds the memory of a gradient.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -22,28 +22,9 @@ from ..base.arrays import gather_vector3
 from ..fields.protocol import Field
 from .occupancy import OccupancyGrid
 from .placing import place_samples
-from .quadrature import Composite, composite
-from .query import (
-    Evaluation,
-)
-from .samples import Samples
+from .quadrature import integrate
+from .query import Evaluation
 from .settings import MarchSettings
-
-
-def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
-    """Quadrature of an evaluated batch; differentiable in density and emission.
-
-    Depth is a distance in scene space: in normalised device coordinates, that of the
-    mean t'.
-    """
-    ends = (samples.near, samples.far) if samples.rule == "linear" else None
-    seen = composite(
-        evaluation.density, evaluation.emission, samples.t, samples.delta, samples.count, ends
-    )
-    if samples.ndc is None:
-        return seen
-    distance = samples.ndc.to_distance(seen.depth)
-    return replace(seen, depth=dr.select(seen.opacity > 0, distance, 0))
 
 
 @dataclass

@@ -19,8 +19,8 @@ from ..march.intervals import RaySegments, ray_segments
 from ..march.merging import Layer, integrate_merged, merge
 from ..march.normals import density_gradient
 from ..march.placing import place_samples
+from ..march.quadrature import integrate
 from ..march.query import Evaluation
-from ..march.render import integrate
 from ..march.settings import MarchSettings
 from .placement import PlacedField
 
@@ -299,7 +299,7 @@ class _Crossing:
         self._edges = cut(edges / dr.gather(mi.Float, self.scale, row))
         self.scale = cut(self.scale)
         d = cut(within.d)
-        if samples.rule == "linear":
+        if samples.rule.reads_bounds:
             samples = replace(samples, near=cut(within.near), far=cut(within.far))
         self.samples = replace(
             samples,

@@ -10,7 +10,7 @@ from typing import Any, get_args
 import mitsuba as mi
 
 from ..base.errors import InputError
-from ..march.quadrature import Rule
+from ..march.rules import Rule
 from ..march.settings import MarchSettings
 from .crossing import Marched
 from .film import FieldIntegrator

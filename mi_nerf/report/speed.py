@@ -23,8 +23,8 @@ import numpy as np
 from ..base.machine import machine
 from ..estimators.reference import Reference, reference
 from ..march.occupancy import OccupancyGrid
-from ..march.quadrature import Rule
 from ..march.render import render_rays
+from ..march.rules import Rule
 from ..march.settings import MarchSettings
 from .grids import Grids, own_resolution
 from .pareto import pareto_front

@@ -22,9 +22,9 @@ from ..fields.noise import DensityNoise
 from ..fields.protocol import Field
 from ..march.occupancy import OccupancyGrid
 from ..march.placing import place_samples, refine
-from ..march.quadrature import Composite, over_background
+from ..march.quadrature import Composite, integrate, over_background
 from ..march.query import Evaluation
-from ..march.render import integrate, render_rays
+from ..march.render import render_rays
 from ..march.samples import Samples
 from ..march.settings import MarchSettings
 from .batches import RayBatch, RaySource, blank_loss, step_rng

@@ -26,9 +26,9 @@ import numpy as np
 from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.data import load_dataset
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import Rule, over_background
+from mi_nerf.march.quadrature import integrate, over_background
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
+from mi_nerf.march.rules import Rule
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.tasks.target import open_target
 from mi_nerf.training.batches import RayBatch, RaySource, step_rng

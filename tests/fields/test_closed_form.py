@@ -18,8 +18,9 @@ from mi_nerf.cli import main
 from mi_nerf.fields.closed_form import CLOSED_FORMS, ClosedFormField, closed_form
 from mi_nerf.fields.protocol import Field
 from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate, render_rays
+from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
 from tests.support import closed_forms as oracle
 from tests.support.arrays import unit, vectors

@@ -9,9 +9,9 @@ import numpy as np
 
 from mi_nerf.fields.closed_form import closed_form
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import sample_weights
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
+from mi_nerf.march.rules import sample_weights
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.march.strata import points_along, stratified
 from tests.hard_cases import Finding, relative

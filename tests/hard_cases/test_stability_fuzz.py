@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from mi_nerf.base.arrays import upload
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import Composite, sample_weights
+from mi_nerf.march.quadrature import Composite, integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
+from mi_nerf.march.rules import sample_weights
 from mi_nerf.march.samples import Samples
 from mi_nerf.march.settings import MarchSettings
 from tests.support.analytic import AnalyticField

@@ -14,9 +14,8 @@ from mi_nerf.fields.network import NetworkConfig, initial_weights
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import Composite
+from mi_nerf.march.quadrature import Composite, integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
 from mi_nerf.march.samples import Samples
 from mi_nerf.march.settings import MarchSettings
 from tests.support.analytic import AnalyticField

@@ -16,8 +16,9 @@ from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
 from mi_nerf.march import query
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import RayImage, integrate, ray_chunks, render_rays
+from mi_nerf.march.render import RayImage, ray_chunks, render_rays
 from mi_nerf.march.settings import MarchSettings
 from tests.support.analytic import AnalyticField, ball, gaussian, uniform
 from tests.support.arrays import unit, vectors

@@ -14,8 +14,8 @@ import pytest
 import mi_nerf
 from mi_nerf.fields.neural import NeuralField
 from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
 from tests.support.fields import scene_dict, small_file, weight_keys
 
 SEED = 7

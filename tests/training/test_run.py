@@ -23,9 +23,9 @@ from mi_nerf.data import Dataset, load_dataset
 from mi_nerf.fields.neural import NeuralFieldConfig
 from mi_nerf.formats.field_file import load_field
 from mi_nerf.march.placing import place_samples, refine
-from mi_nerf.march.quadrature import over_background
+from mi_nerf.march.quadrature import integrate, over_background
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate, render_rays
+from mi_nerf.march.render import render_rays
 from mi_nerf.training import run as training
 from mi_nerf.training.batches import step_rng
 from mi_nerf.training.config import OptimizerConfig, TrainConfig, with_settings
