@@ -16,6 +16,7 @@ from ..base.arrays import gather_vector3
 from ..base.color import srgb_to_linear
 from ..base.errors import InputError
 from ..march.intervals import RaySegments, ray_segments
+from ..march.marched import MarchedField
 from ..march.merging import Layer, integrate_merged, merge
 from ..march.normals import density_gradient
 from ..march.placing import place_samples
@@ -242,11 +243,9 @@ class _Crossing:
             dr.eval(o, d, self.scale)
             bounds = marched.bounds(rays.reach, self.scale)
             self.samples = place_samples(
-                self.field,
+                MarchedField(self.field, self._march, self._placed.medium.occupancy),
                 dr.detach(o),
                 dr.detach(d),
-                self._march,
-                occupancy=self._placed.medium.occupancy,
                 jitter=rays.jitter,
                 bounds=dr.detach(bounds),
             )

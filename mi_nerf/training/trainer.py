@@ -20,6 +20,7 @@ from ..fields.fourier import FourierEncoding
 from ..fields.neural import NeuralField, NeuralFieldConfig
 from ..fields.noise import DensityNoise
 from ..fields.protocol import Field
+from ..march.marched import MarchedField
 from ..march.occupancy import OccupancyGrid
 from ..march.placing import place_samples, refine
 from ..march.quadrature import Composite, integrate, over_background
@@ -243,7 +244,7 @@ class Trainer:
         march = replace(self.march_settings(), hidden=0.0, fine=self.config.sampling.fine)
         with dr.suspend_grad():
             seen = render_rays(
-                field or self.field, batch.o, batch.d, march, occupancy=self.occupancy
+                MarchedField(field or self.field, march, self.occupancy), batch.o, batch.d
             )
             predicted = over_background(seen.color, seen.opacity, batch.background)
             target = over_background(batch.color, batch.alpha, batch.background)
@@ -297,11 +298,9 @@ class Trainer:
         march = self.march_settings()
         with stage("samples"):
             samples = place_samples(
-                self.field,
+                MarchedField(self.field, march, self.occupancy),
                 batch.o,
                 batch.d,
-                march,
-                occupancy=self.occupancy,
                 jitter=_rows(jitter, part, sampling.samples),
             )
         wanted = samples.queries

@@ -25,6 +25,7 @@ import numpy as np
 
 from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.data import load_dataset
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
 from mi_nerf.march.quadrature import integrate, over_background
 from mi_nerf.march.query import Evaluation
@@ -190,7 +191,7 @@ def _image(
         offsets = backend.Float(rng.random(count, np.float32)) if jitter else None
         with dr.suspend_grad():
             placed = place_samples(
-                field, part.o, part.d, march, occupancy=occupancy, jitter=offsets
+                MarchedField(field, march, occupancy), part.o, part.d, jitter=offsets
             )
             seen = integrate(Evaluation(field, placed, march.block), placed)
             parts.append(np.array(over_background(seen.color, seen.opacity, part.background)))

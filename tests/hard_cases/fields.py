@@ -8,6 +8,7 @@ import drjit as dr
 import numpy as np
 
 from mi_nerf.fields.closed_form import closed_form
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
 from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
@@ -39,7 +40,7 @@ class Probe:
 
     def errors(self, settings: MarchSettings) -> tuple[float, float]:
         """Relative errors of mi_nerf's opacities (of the largest) and of the derivative."""
-        samples = place_samples(self.field, self._o, self._d, settings)
+        samples = place_samples(MarchedField(self.field, settings), self._o, self._d)
         self._enable()
         evaluation = Evaluation(self.field, samples, 16384, keep=True)
         evaluation.enable_grad()

@@ -18,6 +18,7 @@ from mi_nerf import load_field, save_field
 from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.data import load_dataset
 from mi_nerf.fields.closed_form import closed_form
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples, refine
 from mi_nerf.march.quadrature import composite, integrate
 from mi_nerf.march.query import Evaluation
@@ -265,7 +266,7 @@ def errors(
     march = MarchSettings(samples=samples, rule=rule)
     rays = vectors(ad, o, "64"), vectors(ad, d, "64")
     offsets = ad.Float64(rng.random(200 * samples)) if jitter else None
-    placed = place_samples(field, *rays, march, jitter=offsets)
+    placed = place_samples(MarchedField(field, march), *rays, jitter=offsets)
     seen = integrate(Evaluation(field, placed, 1 << 16), placed)
     v, lines = oracle.values_of(field.config), oracle.Rays.in_box(o, d, field.lower, field.upper)
     found = np.array([np.array(seen.opacity), np.array(seen.depth)])
@@ -319,7 +320,7 @@ def test_the_unit_of_length_does_not_matter(ad: Any, rule: str, scale: float) ->
         o, d = vectors(ad, [(s, 2 * s, 0)] * 50), unit([(-1, -2, 0.02 * i) for i in range(50)])
         jitter = ad.Float(np.random.default_rng(0).random(50))
         march = MarchSettings(samples=40, rule=rule)
-        seen = render_rays(field, o, vectors(ad, d), march, jitter=jitter)
+        seen = render_rays(MarchedField(field, march), o, vectors(ad, d), jitter=jitter)
         images.append([np.array(seen.opacity), np.array(seen.color[0]), np.array(seen.depth) / s])
     assert images[1][0].max() > 0.5
     assert np.array(images[1]) == pytest.approx(np.array(images[0]), rel=2e-4, abs=2e-5)
@@ -333,8 +334,8 @@ def test_rays_that_end_early(ad: Any, rule: str) -> None:
     d = unit(np.random.default_rng(3).normal(size=(64, 3)) - (0, 0, 3))
     rays = vectors(ad, [(0, 0, 0.9)] * 64), vectors(ad, d)
     march = MarchSettings(samples=64, rule=rule)
-    all_of_it = render_rays(field, *rays, march)
-    ended = render_rays(field, *rays, replace(march, stop=0.01))
+    all_of_it = render_rays(MarchedField(field, march), *rays)
+    ended = render_rays(MarchedField(field, replace(march, stop=0.01)), *rays)
     assert ended.queries < 0.8 * all_of_it.queries
     lost = np.array(all_of_it.opacity) - np.array(ended.opacity)
     assert (np.abs(lost) < 0.01).all() and lost.max() > 1e-6
@@ -346,7 +347,7 @@ def test_rays_that_end_early(ad: Any, rule: str) -> None:
 def test_refined_samples_keep_the_rule(ad: Any) -> None:
     field = closed_form("gaussian", {}, ad.TensorXf)
     o, d = vectors(ad, [(0, 0, -3)]), vectors(ad, [(0, 0, 1)])
-    first = place_samples(field, o, d, MarchSettings(samples=8, rule="linear"))
+    first = place_samples(MarchedField(field, MarchSettings(samples=8, rule="linear")), o, d)
     more = refine(first, integrate(Evaluation(field, first, 64), first).weights, 24)
     found = integrate(Evaluation(field, more, 64), more)
     expected, _ = linear_weights(
@@ -362,7 +363,7 @@ def test_widths_are_those_between_the_ends(rule: str, fine: int) -> None:
     field, rng = AnalyticField(uniform(1.0)), np.random.default_rng(3)
     o, d = vectors(AD, np.full((9, 3), 0.1)), vectors(AD, unit(rng.normal(size=(9, 3))))
     march = MarchSettings(samples=12, rule=rule)
-    placed = place_samples(field, o, d, march, jitter=AD.Float(rng.random(9 * 12)))
+    placed = place_samples(MarchedField(field, march), o, d, jitter=AD.Float(rng.random(9 * 12)))
     if fine:
         placed = refine(placed, AD.Float(rng.random(9 * 12)), fine)
     ends = np.array(placed.edges()).reshape(9, 13 + fine)
