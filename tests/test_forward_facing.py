@@ -31,7 +31,7 @@ from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.march.view import render_view
 from mi_nerf.training.config import TrainConfig
-from mi_nerf.training.trainer import field_config
+from mi_nerf.training.model import field_config
 from tests.support.analytic import AnalyticField, uniform
 from tests.support.arrays import unit, vectors
 from tests.support.datasets import forward_poses, orbit_poses, write_llff_dataset

@@ -119,7 +119,7 @@ def test_grids_of_a_ball(ad: Any) -> None:
 
 def subject_of(field: Any, march: MarchSettings, rays: int = 64) -> Any:
     base = open_subject("slab", VARIANT, rays=rays, views=1)
-    return replace(base, formula=False, field=field, march=march)
+    return replace(base, formula=False, marched=MarchedField(field, march))
 
 
 def test_every_setting_once_and_the_own_first() -> None:
@@ -234,7 +234,7 @@ def test_what_display_values_may_be_off_by(blob_run: Path) -> None:
     for space in ("srgb", "linear"):
         field = AnalyticField(lambda p: p[0])
         field.color_space = space
-        seen = replace(subject, field=field)
+        seen = replace(subject, marched=replace(subject.marched, field=field))
         bound = seen.shown_error(color, opacity, error)
         for _ in range(20):
             off = error * rng.uniform(-1, 1, error.shape)

@@ -30,11 +30,12 @@ from mi_nerf.march.render import render_rays
 from mi_nerf.training import run as training
 from mi_nerf.training.batches import step_rng
 from mi_nerf.training.config import OptimizerConfig, TrainConfig, with_settings
+from mi_nerf.training.model import resolved_octaves
 from mi_nerf.training.presets import preset
 from mi_nerf.training.run import TrainingError
 from mi_nerf.training.run_folder import read_config
 from mi_nerf.training.schedule import learning_rate
-from mi_nerf.training.trainer import Trainer, resolved_octaves
+from mi_nerf.training.trainer import Trainer
 from tests.support.datasets import write_blob_dataset
 
 SIZE, VIEWS = 20, 6
