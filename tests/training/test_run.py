@@ -439,12 +439,7 @@ def test_sample_positions_are_detached(views: Dataset) -> None:
         for name, tensor in trainer.field.parameters().items():
             trainer.optimizer.assign(name, tensor * factor)
         runs.append(trainer)
-        trainer.optimizer.zero_grad()
-        rng = step_rng(ad.Float, config.seed, 0)
-        batch = trainer._source.draw(64, rng)
-        jitter = rng.random(ad.Float, 64 * 12)
-        fine_jitter = rng.random(ad.Float, 64 * config.sampling.fine)
-        trainer._differentiate(batch, (0, 64), 64, jitter, fine_jitter)
+        trainer._differentiate(trainer._draw())
     a, b = ({n: np.array(dr.grad(t)) for n, t in run.parameters.items()} for run in runs)
     for name, gradient in a.items():
         if name.startswith("coarse."):
