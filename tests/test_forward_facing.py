@@ -23,13 +23,15 @@ from mi_nerf.cameras.poses import average_pose, look_at
 from mi_nerf.cameras.trajectory import forward_spiral
 from mi_nerf.cli import main
 from mi_nerf.data import hull, load_dataset
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate, render_rays
+from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.march.view import render_view
 from mi_nerf.training.config import TrainConfig
-from mi_nerf.training.trainer import field_config
+from mi_nerf.training.model import field_config
 from tests.support.analytic import AnalyticField, uniform
 from tests.support.arrays import unit, vectors
 from tests.support.datasets import forward_poses, orbit_poses, write_llff_dataset
@@ -59,7 +61,9 @@ def test_samples_are_even_in_disparity(ad: Any) -> None:
     """Strata of equal width in t' from 0 to 1, at the projections of points on the ray."""
     o, d = forward_rays(20)
     field = AnalyticField(uniform(1.0), ndc=NDC)
-    samples = place_samples(field, vectors(ad, o), vectors(ad, d), MarchSettings(samples=8))
+    samples = place_samples(
+        MarchedField(field, MarchSettings(samples=8)), vectors(ad, o), vectors(ad, d)
+    )
     assert samples.ndc is not None and samples.queries == 160
     length = np.array(samples.ndc.length)
     t = np.array(samples.t).reshape(20, 8) / length[:, None]
@@ -79,7 +83,9 @@ def test_samples_are_even_in_disparity(ad: Any) -> None:
 def test_emission_sees_directions_before_projection(ad: Any) -> None:
     o, d = forward_rays(30)
     field = AnalyticField(uniform(1e3), lambda p, d: [d.x, d.y, d.z], ndc=NDC)
-    seen = render_rays(field, vectors(ad, o), vectors(ad, d), MarchSettings(samples=4))
+    seen = render_rays(
+        MarchedField(field, MarchSettings(samples=4)), vectors(ad, o), vectors(ad, d)
+    )
     assert np.array(seen.color).T == pytest.approx(d, abs=1e-5)
 
 
@@ -93,7 +99,7 @@ def wall(depth: float) -> AnalyticField:
 def test_depth_is_a_distance_along_the_ray(ad: Any, depth: float) -> None:
     o, d = forward_rays(30)
     settings = MarchSettings(samples=2000)
-    seen = render_rays(wall(depth), vectors(ad, o), vectors(ad, d), settings)
+    seen = render_rays(MarchedField(wall(depth), settings), vectors(ad, o), vectors(ad, d))
     expected = (-depth - o[:, 2]) / d[:, 2]
     assert np.array(seen.opacity) == pytest.approx(np.ones(30))
     # A stratum is 1/2000 of t', and dt = dt'·depth² on the axis.
@@ -103,14 +109,18 @@ def test_depth_is_a_distance_along_the_ray(ad: Any, depth: float) -> None:
 def test_empty_space_has_no_depth(ad: Any) -> None:
     o, d = forward_rays(5)
     field = AnalyticField(uniform(0.0), ndc=NDC)
-    seen = render_rays(field, vectors(ad, o), vectors(ad, d), MarchSettings(samples=4))
+    seen = render_rays(
+        MarchedField(field, MarchSettings(samples=4)), vectors(ad, o), vectors(ad, d)
+    )
     assert not np.array(seen.depth).any() and not np.array(seen.opacity).any()
 
 
 def test_rays_that_face_backwards_see_nothing(ad: Any) -> None:
     o, d = forward_rays(6)
     d[::2, 2] *= -1
-    seen = render_rays(wall(2.0), vectors(ad, o), vectors(ad, d), MarchSettings(samples=64))
+    seen = render_rays(
+        MarchedField(wall(2.0), MarchSettings(samples=64)), vectors(ad, o), vectors(ad, d)
+    )
     assert np.array(seen.opacity) == pytest.approx([0, 1, 0, 1, 0, 1])
 
 
@@ -122,7 +132,9 @@ def test_nothing_behind_a_camera_beyond_the_near_plane(ad: Any) -> None:
     )
     o = np.array([(0, 0, 0), (0, 0, -2.4), (0, 0, -3.5)], np.float32)
     d = np.tile(np.float32((0, 0, -1)), (3, 1))
-    seen = render_rays(field, vectors(ad, o), vectors(ad, d), MarchSettings(samples=3000))
+    seen = render_rays(
+        MarchedField(field, MarchSettings(samples=3000)), vectors(ad, o), vectors(ad, d)
+    )
     crossed = np.array([high - low, high - (1 - 2 / 2.4), 0])
     assert np.array(seen.opacity) == pytest.approx(1 - np.exp(-3 * crossed), abs=2e-3)
 
@@ -134,9 +146,9 @@ def test_bounds_are_distances(ad: Any) -> None:
     rays = vectors(ad, o), vectors(ad, d)
     reach = 4 / -d[:, 2]  # where the ray meets z-depth 4
     settings = MarchSettings(samples=256, near=0.5, far=float(reach.min() * 0.99))
-    assert not np.array(render_rays(wall(4.0), *rays, settings).opacity).any()
+    assert not np.array(render_rays(MarchedField(wall(4.0), settings), *rays).opacity).any()
     settings = MarchSettings(samples=256, near=float(reach.max() * 1.01))
-    depth = np.array(render_rays(wall(4.0), *rays, settings).depth)
+    depth = np.array(render_rays(MarchedField(wall(4.0), settings), *rays).depth)
     assert depth == pytest.approx(np.full(10, settings.near), rel=0.05)
 
 
@@ -146,7 +158,7 @@ def test_depth_is_differentiable(ad: Any) -> None:
 
     def depth(density: Any) -> Any:
         field = AnalyticField(uniform(1.0), ndc=NDC)
-        samples = place_samples(field, o, d, MarchSettings(samples=16))
+        samples = place_samples(MarchedField(field, MarchSettings(samples=16)), o, d)
         evaluation = Evaluation(field, samples, 64)
         evaluation._channels[0] = density + dr.zeros(ad.Float, 48)
         return dr.sum(integrate(evaluation, samples).depth)
@@ -187,8 +199,7 @@ def test_mitsuba_sees_what_evaluation_sees(scale: float, tmp_path: Path) -> None
 
     contents = load_field(path)
     backend = array_module(variant)
-    field, occupancy = contents.build(backend)
-    view = render_view(field, camera, pose, contents.march, backend, occupancy=occupancy, spp=64)
+    view = render_view(contents.marched(backend), camera, pose, backend, spp=64)
     assert view.opacity.max() > 0.3
     expected = np.concatenate([view.color, view.opacity[..., None]], axis=-1)
     assert np.abs(expected - seen[..., :4]).max() < 0.02

@@ -11,7 +11,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..base.errors import InputError
 from ..base.variants import choose_variant
-from ..march.quadrature import Rule
+from ..march.rules import Rule
 from ..report import Knobs, report, report_training, rows_of
 from ..report.curves_text import conclusions
 from ..report.profile import summary

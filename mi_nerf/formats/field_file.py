@@ -16,6 +16,7 @@ from ..fields.fourier import FourierEncoding
 from ..fields.hash_grid import HashGridConfig
 from ..fields.network import NetworkConfig
 from ..fields.neural import NeuralField, NeuralFieldConfig
+from ..march.marched import MarchedField
 from ..march.occupancy import OccupancyGrid
 from ..march.settings import MarchSettings
 
@@ -46,6 +47,11 @@ class FieldFile:
             return neural, None
         grid = OccupancyGrid(neural.lower, neural.upper, self.occupancy, backend.Float)
         return neural, grid
+
+    def marched(self, backend: Any) -> MarchedField:
+        """The same, with the sampling that suits it."""
+        neural, grid = self.build(backend)
+        return MarchedField(neural, self.march, grid)
 
 
 def save_field(path: str | Path, contents: FieldFile) -> None:

@@ -21,8 +21,8 @@ from typing import Any
 import drjit as dr
 
 from .importance import count_below
-from .quadrature import sample_weights
 from .query import Evaluation
+from .rules import sample_weights
 from .samples import Samples
 
 # No row, or no sample: where a ray misses a field.

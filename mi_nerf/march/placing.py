@@ -7,46 +7,37 @@ from typing import Any
 
 import drjit as dr
 
-from ..fields.protocol import Field
 from .importance import inverse_transform, merge_sorted
 from .intervals import ray_segments
+from .marched import MarchedField
 from .occupancy import OccupancyGrid
-from .quadrature import sample_weights
-from .query import (
-    Evaluation,
-)
+from .query import Evaluation
+from .rules import RULES, sample_weights
 from .samples import Samples
-from .settings import MarchSettings
-from .strata import cell_widths, points_along, stratified
+from .strata import cell_widths, points_along
 
 
 def place_samples(
-    field: Field,
+    marched: MarchedField,
     o: Any,
     d: Any,
-    settings: MarchSettings,
     *,
-    occupancy: OccupancyGrid | None = None,
     jitter: Any = None,
     bounds: tuple[Any, Any] | None = None,
 ) -> Samples:
     """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
 
     ``jitter`` is passed on to :func:`mi_nerf.march.strata`; ``bounds`` limits t
-    ray by ray, besides what ``settings`` say. Sample positions carry no gradient. In
+    ray by ray, besides what the settings say. Sample positions carry no gradient. In
     normalised device coordinates samples are evenly spread in t' (NeRF, appendix C).
     """
+    field, settings, occupancy = marched.field, marched.settings, marched.occupancy
     with dr.suspend_grad():
         within = ray_segments(field, o, d, (settings.near, settings.far), bounds or (None, None))
         o, d, near, far = within.o, within.d, within.near, within.far
-        t, delta = stratified(near, far, settings.samples, jitter)
-        even = settings.rule == "constant"
-        if not even:
-            delta = cell_widths(t, near, far, settings.samples)
-        count, rule, ndc = settings.samples, settings.rule, within.ndc
-        samples = Samples(
-            o, d, within.view, t, delta, count, near, far, ndc=ndc, rule=rule, even=even
-        )
+        rule, count = RULES[settings.rule], settings.samples
+        t, delta = rule.place(near, far, count, jitter)
+        samples = Samples(o, d, within.view, t, delta, count, near, far, ndc=within.ndc, rule=rule)
         samples = _select(samples, within.hit, occupancy, settings.hidden)
         coarse = getattr(field, "coarse", None)
         if coarse is None or not settings.fine:
@@ -73,7 +64,7 @@ def refine(
         weights: theirs; without gradient.
         jitter: R·F numbers in [0, 1), or R to shift all of a ray alike; ``None`` for the
             middle of the strata of the cumulative distribution.
-        hidden: as in :class:`MarchSettings`.
+        hidden: as in :class:`mi_nerf.march.settings.MarchSettings`.
     """
     with dr.suspend_grad():
         near, far, count = samples.near, samples.far, samples.count
@@ -86,7 +77,7 @@ def refine(
             delta=delta,
             count=count + fine,
             coarse_queries=samples.queries,
-            even=False,
+            rule=samples.rule.refined,
         )
         return _select(merged, far > near, occupancy, hidden)
 

@@ -13,37 +13,17 @@ block, which is what bounds the memory of a gradient.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 
 from ..base.arrays import gather_vector3
-from ..fields.protocol import Field
-from .occupancy import OccupancyGrid
+from .marched import MarchedField
 from .placing import place_samples
-from .quadrature import Composite, composite
-from .query import (
-    Evaluation,
-)
-from .samples import Samples
+from .quadrature import integrate
+from .query import Evaluation
 from .settings import MarchSettings
-
-
-def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
-    """Quadrature of an evaluated batch; differentiable in density and emission.
-
-    Depth is a distance in scene space: in normalised device coordinates, that of the
-    mean t'.
-    """
-    ends = (samples.near, samples.far) if samples.rule == "linear" else None
-    seen = composite(
-        evaluation.density, evaluation.emission, samples.t, samples.delta, samples.count, ends
-    )
-    if samples.ndc is None:
-        return seen
-    distance = samples.ndc.to_distance(seen.depth)
-    return replace(seen, depth=dr.select(seen.opacity > 0, distance, 0))
 
 
 @dataclass
@@ -63,15 +43,7 @@ def ray_chunks(rays: int, settings: MarchSettings) -> Iterator[tuple[int, int]]:
         yield start, min(size, rays - start)
 
 
-def render_rays(
-    field: Field,
-    o: Any,
-    d: Any,
-    settings: MarchSettings,
-    *,
-    occupancy: OccupancyGrid | None = None,
-    jitter: Any = None,
-) -> RayImage:
+def render_rays(marched: MarchedField, o: Any, d: Any, *, jitter: Any = None) -> RayImage:
     """Renders R rays without derivatives, in chunks of bounded memory.
 
     Args:
@@ -79,17 +51,15 @@ def render_rays(
         jitter: R numbers in [0, 1) that shift the samples of each ray within their
             strata; ``None`` for the middle of each stratum.
     """
-    float_type = type(o[0])
+    float_type, settings = type(o[0]), marched.settings
     rays = max(len(o[0]), len(d[0]))
     outputs = [dr.zeros(float_type, rays) for _ in range(5)]
     queries = 0
     with dr.suspend_grad():
         for start, size in ray_chunks(rays, settings):
             index, chunk_o, chunk_d, offset = slice_rays(o, d, jitter, start, size)
-            samples = place_samples(
-                field, chunk_o, chunk_d, settings, occupancy=occupancy, jitter=offset
-            )
-            evaluation = Evaluation(field, samples, settings.block, stop=settings.stop)
+            samples = place_samples(marched, chunk_o, chunk_d, jitter=offset)
+            evaluation = Evaluation(marched.field, samples, settings.block, stop=settings.stop)
             result = integrate(evaluation, samples)
             values = [*result.color, result.opacity, result.depth]
             for output, value in zip(outputs, values, strict=True):

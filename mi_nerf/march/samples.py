@@ -8,13 +8,17 @@ from typing import Any
 import drjit as dr
 
 from ..cameras.ndc import NdcRays
-from .quadrature import Rule
-from .strata import cell_edges, stratum_edges
+from .rules import RULES, CellRule
 
 
 @dataclass
 class Samples:
-    """R·S samples of R rays, and which of them the field has to be asked about."""
+    """R·S samples of R rays, and which of them the field has to be asked about.
+
+    ``delta`` is kept besides :meth:`edges`, whose differences it equals but for rounding: far
+    from a ray's origin, ends in single precision agree in most of their digits, and little
+    of a short interval's length would survive their subtraction.
+    """
 
     o: Any  # R origins, in the space where the field lives
     d: Any  # R unit directions in that space
@@ -27,8 +31,7 @@ class Samples:
     index: Any = None  # the M samples to evaluate, ascending
     coarse_queries: int = 0  # of the coarse network, by which the samples were placed
     ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
-    rule: Rule = "constant"
-    even: bool = True  # whether the intervals are equal strata of the ray
+    rule: CellRule = RULES["constant"]  # of quadrature
 
     @property
     def rays(self) -> int:
@@ -42,9 +45,7 @@ class Samples:
 
     def edges(self) -> Any:
         """R·(S + 1) ascending ends of the intervals: sample s lies between s and s + 1."""
-        if self.even:
-            return stratum_edges(self.near, self.far, self.count)
-        return cell_edges(self.t, self.near, self.far, self.count)
+        return self.rule.edges(self.t, self.near, self.far, self.count)
 
     def truncate(self, budget: int) -> Any:
         """Keeps the first ``budget`` queries; returns how many rays keep all of theirs.

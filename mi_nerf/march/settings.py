@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import get_args
 
-from .quadrature import Rule
+from .rules import Rule
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,8 @@ from numpy.typing import ArrayLike
 from ..base.arrays import vector3_type
 from ..base.color import linear_to_srgb
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
-from ..fields.protocol import Field
-from .occupancy import OccupancyGrid
+from .marched import MarchedField
 from .render import render_rays
-from .settings import MarchSettings
 
 Image = np.ndarray[Any, Any]
 
@@ -35,13 +33,11 @@ class View:
 
 
 def render_view(
-    field: Field,
+    marched: MarchedField,
     intrinsics: Intrinsics,
     cam_to_world: ArrayLike,
-    march: MarchSettings,
     backend: Any,
     *,
-    occupancy: OccupancyGrid | None = None,
     spp: int = 1,
 ) -> View:
     """Renders one view through pixel centres, or a regular grid of ``spp`` points a pixel.
@@ -57,7 +53,7 @@ def render_view(
     for i in range(side * side):
         offset = ((i % side + 0.5) / side, (i // side + 0.5) / side)
         o, d = _rays(intrinsics, cam_to_world, backend, offset)
-        seen = render_rays(field, o, d, march, occupancy=occupancy)
+        seen = render_rays(marched, o, d)
         planes = np.stack([np.array(v) for v in (*seen.color, seen.opacity, seen.depth)])
         total.append(planes)
         queries += seen.queries

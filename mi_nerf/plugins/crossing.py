@@ -11,11 +11,12 @@ import mitsuba as mi
 
 from ..base.errors import InputError
 from ..march.intervals import RaySegments, ray_segments
+from ..march.marched import MarchedField
 from ..march.merging import Layer
 from ..march.normals import density_gradient
 from ..march.placing import place_samples
 from ..march.query import Evaluation
-from .marched import Marched, Rays
+from .sampled import Rays, SampledField
 
 
 class Crossing:
@@ -24,7 +25,7 @@ class Crossing:
     def __init__(
         self,
         number: int,
-        marched: Marched,
+        marched: SampledField,
         ray: Any,
         rays: Rays,
         mode: dr.ADMode,
@@ -45,11 +46,9 @@ class Crossing:
             dr.eval(o, d, self.scale)
             bounds = marched.bounds(rays.reach, self.scale)
             self.samples = place_samples(
-                self.field,
+                MarchedField(self.field, self._march, self._placed.medium.occupancy),
                 dr.detach(o),
                 dr.detach(d),
-                self._march,
-                occupancy=self._placed.medium.occupancy,
                 jitter=rays.jitter,
                 bounds=dr.detach(bounds),
             )
@@ -102,7 +101,7 @@ class Crossing:
         self._edges = cut(edges / dr.gather(mi.Float, self.scale, row))
         self.scale = cut(self.scale)
         d = cut(within.d)
-        if samples.rule == "linear":
+        if samples.rule.reads_bounds:
             samples = replace(samples, near=cut(within.near), far=cut(within.far))
         self.samples = replace(
             samples,
@@ -149,7 +148,7 @@ class Moving:
 
 
 def crossings(
-    fields: list[Marched], rays: Rays, mode: dr.ADMode, emission: bool = True
+    fields: list[SampledField], rays: Rays, mode: dr.ADMode, emission: bool = True
 ) -> Iterator[Crossing]:
     """The fields that any of the rays cross."""
     if len(fields) == 1:

@@ -12,8 +12,8 @@ import numpy as np
 from ..base.arrays import upload
 from ..base.box import Corner
 from ..march.intervals import box_interval
-from .marched import Marched
 from .placement import Matrix, PlacedField
+from .sampled import SampledField
 
 
 class FieldLight:
@@ -28,7 +28,7 @@ class FieldLight:
     finite everywhere, inside of boxes too.
     """
 
-    def __init__(self, fields: list[Marched]) -> None:
+    def __init__(self, fields: list[SampledField]) -> None:
         """Fields in normalised device coordinates have no box in the scene: none is made."""
         found = [_box(m.placed) for m in fields if m.field.ndc is None]
         self._boxes = [box for box in found if box is not None]

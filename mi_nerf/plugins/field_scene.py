@@ -11,7 +11,7 @@ import mitsuba as mi
 from .backdrop import Backdrop, Hit, Light
 from .film import CameraRays, Channels
 from .integral import Integral, Seen, chunks, see
-from .marched import Marched, Rays
+from .sampled import Rays, SampledField
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Traced:
 class FieldScene:
     """The fields of a scene and what stands around them, for the time of one rendering."""
 
-    def __init__(self, fields: list[Marched], backdrop: Backdrop, normals: bool):
+    def __init__(self, fields: list[SampledField], backdrop: Backdrop, normals: bool):
         self._fields, self._backdrop, self._normals = fields, backdrop, normals
 
     def trace(self, camera: CameraRays) -> Traced:

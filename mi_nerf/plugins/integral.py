@@ -13,9 +13,9 @@ import numpy as np
 
 from ..base.color import srgb_to_linear
 from ..march.merging import integrate_merged, merge
-from ..march.render import integrate
+from ..march.quadrature import integrate
 from .crossing import Crossing, crossings
-from .marched import Marched, Rays
+from .sampled import Rays, SampledField
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Seen:
         return self.values[3]
 
 
-def see(fields: list[Marched], rays: Rays, *, normals: bool = False) -> Seen:
+def see(fields: list[SampledField], rays: Rays, *, normals: bool = False) -> Seen:
     """Radiance and opacity of the fields along R rays, in chunks of bounded memory."""
     count = len(rays.o[0])
     values = [dr.zeros(mi.Float, count) for _ in range(5)]
@@ -55,7 +55,7 @@ def see(fields: list[Marched], rays: Rays, *, normals: bool = False) -> Seen:
     return Seen(values, normal, index)
 
 
-def transmittance(fields: list[Marched], rays: Rays) -> Any:
+def transmittance(fields: list[SampledField], rays: Rays) -> Any:
     """The share of light that the fields let pass along R rays, for which colours do not matter."""
     through = dr.full(mi.Float, 1, len(rays.o[0]))
     dr.make_opaque(through)
@@ -77,7 +77,7 @@ class Integral:
     index: Any  # number of the field that contributes most, from 1; without history
 
     def __init__(
-        self, fields: list[Marched], rays: Rays, mode: dr.ADMode, *, normals: bool = False
+        self, fields: list[SampledField], rays: Rays, mode: dr.ADMode, *, normals: bool = False
     ) -> None:
         self._rays, self._normals = len(rays.o[0]), normals
         self._crossings = list(crossings(fields, rays, mode))
@@ -157,7 +157,7 @@ class Integral:
         self.normal = [n * inverse for n in sums]
 
 
-def optical_depth(fields: list[Marched], rays: Rays) -> Any:
+def optical_depth(fields: list[SampledField], rays: Rays) -> Any:
     """Of all fields along R rays, without derivatives: only densities are asked for.
 
     As opaque as :class:`Integral` finds them. Densities add up, so nothing has to be merged.
@@ -175,7 +175,7 @@ def optical_depth(fields: list[Marched], rays: Rays) -> Any:
     return total
 
 
-def chunks(fields: list[Marched], rays: Rays) -> Iterator[tuple[Any, Rays]]:
+def chunks(fields: list[SampledField], rays: Rays) -> Iterator[tuple[Any, Rays]]:
     """The rays that cross any field, in parts of bounded memory, with their numbers."""
     samples = dr.zeros(mi.UInt32, len(rays.o[0]))  # of all fields along each ray
     for marched in fields:

@@ -8,11 +8,11 @@ from typing import Any, get_args
 import mitsuba as mi
 
 from ..base.errors import InputError
-from ..march.quadrature import Rule
+from ..march.rules import Rule
 from ..march.settings import MarchSettings
 from .film import FieldIntegrator
-from .marched import Marched
 from .placement import PlacedField
+from .sampled import SampledField
 
 
 class MarchingIntegrator(FieldIntegrator):
@@ -57,10 +57,11 @@ class MarchingIntegrator(FieldIntegrator):
         """One offset a ray, or ``None``."""
         return sampler.next_1d() if self.jitter else None
 
-    def _marched(self, found: list[PlacedField], encoded: bool = False) -> list[Marched]:
+    def _marched(self, found: list[PlacedField], encoded: bool = False) -> list[SampledField]:
         """The fields of the scene, and how they are sampled."""
         return [
-            Marched(placed, self._march(placed), self.near, self.far, encoded) for placed in found
+            SampledField(placed, self._march(placed), self.near, self.far, encoded)
+            for placed in found
         ]
 
     def _march(self, placed: PlacedField) -> MarchSettings:
@@ -70,7 +71,7 @@ class MarchingIntegrator(FieldIntegrator):
         rule = self.rule or march.rule
         return replace(march, samples=samples, near=None, far=None, rule=rule, stop=stop)
 
-    def _wants_normals(self, fields: list[Marched]) -> bool:
+    def _wants_normals(self, fields: list[SampledField]) -> bool:
         """Whether normals are among the channels."""
         normals = any(kind == "normal" for _, kind in self.aovs)
         if normals and any(marched.field.ndc is not None for marched in fields):

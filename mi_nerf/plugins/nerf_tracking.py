@@ -16,8 +16,8 @@ from ..march.intervals import ray_segments
 from ..march.quadrature import over_background
 from .backdrop import Environment
 from .film import CameraRays, Channels, FieldIntegrator
-from .marched import Marched
 from .placement import find_fields
+from .sampled import SampledField
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class Tracked:
 class TrackedScene:
     """The field of a scene before its environment, for the time of one rendering."""
 
-    marched: Marched
+    marched: SampledField
     environment: Environment
     majorants: Majorants
     grow: bool  # whether rays may correct the majorants
@@ -171,7 +171,7 @@ class NerfTrackingIntegrator(FieldIntegrator):
         majorants = Majorants.constant(field, self.majorant, occupancy, mi.Float)
         return TrackedScene(marched, environment, majorants, False)
 
-    def _marched(self, scene: mi.Scene) -> Marched:
+    def _marched(self, scene: mi.Scene) -> SampledField:
         """The field of the scene."""
         placed = find_fields(scene)
         if len(placed) > 1:
@@ -179,7 +179,7 @@ class NerfTrackingIntegrator(FieldIntegrator):
                 f"nerf_tracking: the scene holds {len(placed)} fields, expected one "
                 "('nerf' shows several)"
             )
-        marched = Marched(placed[0], placed[0].medium.march, self.near, self.far)
+        marched = SampledField(placed[0], placed[0].medium.march, self.near, self.far)
         if marched.field.color_space == "srgb" and not self.encoded:
             raise InputError(
                 "nerf_tracking: the field was trained on sRGB images, and decoding what is "

@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .marched import Rays
+from .sampled import Rays
 
 
 @dataclass(frozen=True)

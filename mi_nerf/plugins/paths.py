@@ -13,8 +13,8 @@ from mitsuba.python.ad.integrators.common import mis_weight
 from .backdrop import Backdrop, Hit, Light
 from .field_light import FieldLight
 from .integral import see, transmittance
-from .marched import Marched, Rays
 from .path_state import Chance, Connections, Ends, Image, Paths, PathSettings, gather
+from .sampled import Rays, SampledField
 
 _MOST_SURVIVE = 0.95  # of a wavefront in Russian roulette, as in Mitsuba's path tracer
 
@@ -37,7 +37,7 @@ class PathsBehind(Backdrop):
     def __init__(
         self,
         scene: mi.Scene,
-        marched: list[Marched],
+        marched: list[SampledField],
         settings: PathSettings,
         normals: bool,
     ) -> None:

@@ -170,8 +170,7 @@ def _places(
         return None, f"{subject.name} is {kind}: --point says where to look"
     try:
         views = load_dataset(folder, "train", downscale=target.downscale)
-        camera, poses, march = views.intrinsics, views.cam_to_world, subject.march
-        found = find_points(field, subject.occupancy, camera, poses, march, subject.backend)
+        found = find_points(subject.marched, views.intrinsics, views.cam_to_world, subject.backend)
     except InputError as error:
         return None, str(error)
     return found, None

@@ -22,9 +22,9 @@ import numpy as np
 
 from ..base.machine import machine
 from ..estimators.reference import Reference, reference
-from ..march.occupancy import OccupancyGrid
-from ..march.quadrature import Rule
+from ..march.marched import MarchedField
 from ..march.render import render_rays
+from ..march.rules import Rule
 from ..march.settings import MarchSettings
 from .grids import Grids, own_resolution
 from .pareto import pareto_front
@@ -125,14 +125,18 @@ def sweep(
     total = (repeats + 1) * len(settings)
     notify = on_render or (lambda _: None)
     subject = subject.first(_affordable_rays(subject, settings, repeats, seconds))
-    grids = Grids(subject.field, subject.occupancy, subject.backend.Float)
+    own = subject.marched
+    grids = Grids(own.field, own.occupancy, subject.backend.Float)
     exact, record = _reference(subject, seconds)
-    built = {s: subject.occupancy if s.grid is None else grids.at(*s.grid) for s in settings}
+    built = {
+        s: replace(own, settings=s.march, occupancy=grids.at(*s.grid) if s.grid else own.occupancy)
+        for s in settings
+    }
     seen: dict[Setting, Seen] = {}
     times: dict[Setting, list[float]] = {s: [] for s in settings}
     for turn in range(repeats + 1):
         for setting in settings:
-            elapsed, found = _render(subject, setting.march, built[setting])
+            elapsed, found = _render(subject, built[setting])
             if turn:
                 times[setting].append(elapsed)
             else:
@@ -153,9 +157,9 @@ def sweep(
         "views": dict(subject.views),
         "repeats": repeats,
         "machine": machine(subject.variant),
-        "near": subject.march.near,
-        "far": subject.march.far,
-        "own_grid": None if subject.occupancy is None else list(subject.occupancy.shape),
+        "near": own.settings.near,
+        "far": own.settings.far,
+        "own_grid": None if own.occupancy is None else list(own.occupancy.shape),
         "reference": record,
         "points": points,
     }
@@ -163,7 +167,7 @@ def sweep(
 
 def settings_of(subject: Subject, knobs: Knobs) -> dict[Setting, list[str]]:
     """All that a sweep tries, once each, and the knobs that lead there; the own ones first."""
-    march = subject.march
+    march = subject.marched.settings
     both = march.fine > 0 and getattr(subject.field, "coarse", None) is not None
     march = march if both else replace(march, fine=0)
     found: dict[Setting, list[str]] = {Setting(march): ["own"]}
@@ -184,7 +188,7 @@ def settings_of(subject: Subject, knobs: Knobs) -> dict[Setting, list[str]]:
         add("split", Setting(replace(march, samples=samples, fine=fine)))
     for stop in knobs.stops:
         add("stop", Setting(replace(march, stop=stop)))
-    middle = own_resolution(subject.occupancy) or _RESOLUTION
+    middle = own_resolution(subject.marched.occupancy) or _RESOLUTION
     for resolution in knobs.resolutions:
         add("resolution", Setting(march, (resolution, _THRESHOLD)))
     for threshold in knobs.thresholds:
@@ -195,12 +199,10 @@ def settings_of(subject: Subject, knobs: Knobs) -> dict[Setting, list[str]]:
 # ---- One rendering ---------------------------------------------------------------
 
 
-def _render(
-    subject: Subject, march: MarchSettings, grid: OccupancyGrid | None
-) -> tuple[float, Seen]:
+def _render(subject: Subject, marched: MarchedField) -> tuple[float, Seen]:
     """Seconds that it took, and what was seen."""
     start = time.perf_counter()
-    found = render_rays(subject.field, subject.o, subject.d, march, occupancy=grid)
+    found = render_rays(marched, subject.o, subject.d)
     dr.sync_thread()
     elapsed = time.perf_counter() - start
     color = np.transpose([np.array(c, np.float64) for c in found.color])
@@ -264,8 +266,8 @@ def _reference(subject: Subject, seconds: float) -> tuple[Reference, dict[str, A
             some.field,
             some.o,
             some.d,
-            occupancy=some.occupancy,
-            bounds=(some.march.near, some.march.far),
+            occupancy=some.marched.occupancy,
+            bounds=(some.marched.settings.near, some.marched.settings.far),
             tolerance=tolerance,
             max_intervals=most,
         )
@@ -301,7 +303,7 @@ def _affordable_rays(
     few = subject.first(4 * _FEWEST_RAYS)
     own = next(iter(settings)).march
     for _ in range(2):  # the first one compiles
-        elapsed, _ = _render(few, own, few.occupancy)
+        elapsed, _ = _render(few, replace(few.marched, settings=own))
     size = [(s.march.samples + s.march.fine) / (own.samples + own.fine) for s in settings]
     whole = elapsed / few.rays * sum(size) * (repeats + 1)
     return max(_FEWEST_RAYS, min(subject.rays, int(seconds / whole)))

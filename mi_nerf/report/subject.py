@@ -22,7 +22,7 @@ from ..data import held_out_split
 from ..fields.closed_form import CLOSED_FORMS, ClosedFormField, closed_form
 from ..fields.protocol import Field
 from ..images.metrics import to_8bit
-from ..march.occupancy import OccupancyGrid
+from ..march.marched import MarchedField
 from ..march.settings import MarchSettings
 from ..tasks.evaluate import held_out, reference_image
 from ..tasks.target import Target, open_target
@@ -42,15 +42,18 @@ class Subject:
 
     name: str
     formula: bool  # the field is one of mi_nerf.fields.closed_form
-    field: Field
-    occupancy: OccupancyGrid | None  # the field's own grid
-    march: MarchSettings  # the field's own settings
+    marched: MarchedField  # with its own settings and grid
     backend: Any  # e.g. drjit.llvm.ad
     variant: str
     o: Any = None  # R origins
     d: Any = None  # R unit directions
     truth: Array | None = None  # (R, 3) what images show there: sRGB, on white, 8 bits
     views: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # where rays come from
+
+    @property
+    def field(self) -> Field:
+        """The field alone."""
+        return self.marched.field
 
     @property
     def rays(self) -> int:
@@ -154,14 +157,11 @@ def open_field(
     backend = array_module(variant)
     opened = _opened(target)
     if isinstance(opened, str):
-        formula = _formula(opened, values or {}, backend)
-        return Subject(opened, True, formula, None, MarchSettings(), backend, variant)
+        formula = MarchedField(_formula(opened, values or {}, backend), MarchSettings())
+        return Subject(opened, True, formula, backend, variant)
     if values:
         raise InputError("{}: {} is no formula", Option("values", next(iter(values))), opened.path)
-    field, occupancy = opened.contents.build(backend)
-    return Subject(
-        str(opened.path), False, field, occupancy, opened.contents.march, backend, variant
-    )
+    return Subject(str(opened.path), False, opened.contents.marched(backend), backend, variant)
 
 
 def _opened(target: Target | str | Path) -> Target | str:

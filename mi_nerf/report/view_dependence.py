@@ -14,9 +14,8 @@ from ..base.files import replacing
 from ..base.variants import array_module
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from ..fields.protocol import Field
-from ..march.occupancy import OccupancyGrid
+from ..march.marched import MarchedField
 from ..march.render import render_rays
-from ..march.settings import MarchSettings
 
 Array = np.ndarray[Any, Any]
 
@@ -80,13 +79,7 @@ def surface_normal(field: Field, point: Sequence[float], backend: Any) -> Array:
 
 
 def find_points(
-    field: Field,
-    occupancy: OccupancyGrid | None,
-    intrinsics: Intrinsics,
-    poses: Array,
-    march: MarchSettings,
-    backend: Any,
-    count: int = 3,
+    marched: MarchedField, intrinsics: Intrinsics, poses: Array, backend: Any, count: int = 3
 ) -> Array:
     """Points on surfaces, spread over what some cameras see, (count, 3).
 
@@ -104,7 +97,7 @@ def find_points(
         backend.Float(x.astype(np.float32)),
         backend.Float(y.astype(np.float32)),
     )
-    seen = render_rays(field, o, d, march, occupancy=occupancy)
+    seen = render_rays(marched, o, d)
     opaque = np.array(seen.opacity) > 0.95
     origin, direction = (np.array(v).reshape(3, -1).T[opaque] for v in (o, d))
     points = origin + np.array(seen.depth)[opaque, None] * direction

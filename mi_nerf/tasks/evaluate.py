@@ -55,23 +55,16 @@ def evaluate(
     dataset = held_out(target, data, split, downscale, views)
     folder = None if images is None else make_folder(images)
     backend = array_module(variant)
-    field, occupancy = target.contents.build(backend)
+    marched = target.contents.marched(backend)
     results: list[dict[str, Any]] = []
     qualities: list[dict[str, float]] = []
     seconds, queries = [], 0
     for k, name in enumerate(dataset.names):
         start = time.perf_counter()
-        view = render_view(
-            field,
-            dataset.intrinsics,
-            dataset.cam_to_world[k],
-            target.contents.march,
-            backend,
-            occupancy=occupancy,
-        )
+        view = render_view(marched, dataset.intrinsics, dataset.cam_to_world[k], backend)
         seconds.append(time.perf_counter() - start)
         queries += view.queries
-        predicted = to_8bit(display_image(view, field.color_space))
+        predicted = to_8bit(display_image(view, marched.field.color_space))
         figures = _compare(predicted, reference_image(dataset, k))
         qualities.append(figures)
         result = {"name": name, **{key: _finite(value) for key, value in figures.items()}}

@@ -106,20 +106,13 @@ def run_frames(
     intrinsics = _resized(dataset.intrinsics, size)
     poses = _path_poses(target, dataset, path, frames)
     backend = array_module(variant)
-    field, occupancy = target.contents.build(backend)
+    marched = target.contents.marched(backend)
+    space = marched.field.color_space
 
     def generate() -> Frames:
         for i, pose in enumerate(poses):
-            view = render_view(
-                field,
-                intrinsics,
-                pose,
-                target.contents.march,
-                backend,
-                occupancy=occupancy,
-                spp=spp,
-            )
-            yield f"{path}_{i:03d}", _linear_rgba(view.color, view.opacity, field.color_space)
+            view = render_view(marched, intrinsics, pose, backend, spp=spp)
+            yield f"{path}_{i:03d}", _linear_rgba(view.color, view.opacity, space)
 
     return len(poses), generate()
 

@@ -29,10 +29,11 @@ from typing import Any
 from ..data import Dataset
 from . import probes
 from .config import TrainConfig, to_json, with_settings
+from .model import carved_cells, field_config, resolved_octaves
 from .plain import as_text, leaves
 from .presets import nerf, preset
 from .probes import Probe, Probes
-from .trainer import Trainer, carved_cells, field_config, resolved_octaves
+from .trainer import Trainer
 
 # Of 400 steps on 200×200 pixels: a diffuse scene lost 0.0 and 0.14 dB, a glossy one 0.35
 # and 0.45 dB. Without directions a step takes less time, which makes up for 0.2 dB.

@@ -14,7 +14,7 @@ from ..fields.fourier import FourierEncoding
 from ..fields.fused_network import WIDEST
 from ..fields.hash_grid import HashGridConfig
 from ..fields.network import NetworkConfig
-from ..march.quadrature import Rule
+from ..march.rules import Rule
 from .plain import assign, build, leaf_names, require
 
 

@@ -24,6 +24,7 @@ from ..base.variants import array_module
 from ..cameras.pinhole import Intrinsics
 from ..data import Dataset, load_dataset
 from ..formats.field_file import FieldFile, save_field
+from ..march.marched import MarchedField
 from ..march.settings import MarchSettings
 from ..march.view import Image, View, display_image, render_view
 from .auto import Choice, Decision, choose
@@ -176,12 +177,10 @@ class Run:
         trainer = self.trainer
         with dr.suspend_grad():
             return render_view(
-                trainer.field,
+                MarchedField(trainer.field, self._render_settings(), trainer.occupancy),
                 intrinsics,
                 cam_to_world,
-                self._render_settings(),
                 array_module(self.variant),
-                occupancy=trainer.occupancy,
                 spp=spp,
             )
 

@@ -12,25 +12,25 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..base.box import Corner, grid_shape
 from ..base.errors import InputError
 from ..base.kernel_stages import stage
-from ..data import Dataset, hull
-from ..fields.fourier import FourierEncoding
-from ..fields.neural import NeuralField, NeuralFieldConfig
+from ..data import Dataset
+from ..fields.neural import NeuralField
 from ..fields.noise import DensityNoise
 from ..fields.protocol import Field
+from ..march.marched import MarchedField
 from ..march.occupancy import OccupancyGrid
 from ..march.placing import place_samples, refine
-from ..march.quadrature import Composite, over_background
+from ..march.quadrature import Composite, integrate, over_background
 from ..march.query import Evaluation
-from ..march.render import integrate, render_rays
+from ..march.render import render_rays
 from ..march.samples import Samples
 from ..march.settings import MarchSettings
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
 from .loss_scale import LossScale
 from .losses import LOSSES, squared_error
+from .model import carved_cells, field_config
 from .optimizer import Adam, JointParameters
 
 _FEWEST_RAYS = 8  # in a step
@@ -49,63 +49,6 @@ class StepResult:
     queries: int
 
 
-def field_config(config: TrainConfig, dataset: Dataset) -> NeuralFieldConfig:
-    """The field that a run trains: the configured model over the dataset's box."""
-    if config.box is not None:
-        lower, upper = config.box[:3], config.box[3:]
-    else:
-        lower, upper = hull.view_box(dataset)
-        if config.occupancy.hull:
-            lower, upper = hull.tighten(dataset, lower, upper)
-    color = config.color_activation
-    if color == "auto":
-        color = "sigmoid" if dataset.color_space == "srgb" else "exp"
-    grid = config.grid
-    if grid is not None and grid.finest is None:
-        finest = 2 ** (resolved_octaves(dataset, lower, upper) + 1)
-        grid = replace(grid, finest=max(grid.coarsest, finest))
-    model = NeuralFieldConfig(
-        color_space=dataset.color_space,
-        position=config.position
-        or FourierEncoding(frequencies=resolved_octaves(dataset, lower, upper)),
-        grid=grid,
-        direction=config.direction,
-        network=config.network,
-        density_activation=config.density.activation,
-        density_shift=config.density.shift,
-        density_scale=config.density.gain,
-        color_activation=color,
-        ndc=dataset.ndc,
-    )
-    return model.in_box(lower, upper)
-
-
-def resolved_octaves(dataset: Dataset, lower: Corner, upper: Corner) -> int:
-    """The number of octaves L whose finest has a period of two pixels, seen from the middle.
-
-    The box spans [−1, 1], so octave k has a period of 2^(1−k); finer ones would describe
-    what no image shows.
-    """
-    center = (np.asarray(lower) + np.asarray(upper)) / 2
-    distance = np.median(np.linalg.norm(dataset.cam_to_world[:, :3, 3] - center, axis=1))
-    side = max(b - a for a, b in zip(lower, upper, strict=True))
-    film = dataset.intrinsics
-    pixels = side * film.fx / max(float(distance), 1e-9 * side)
-    if dataset.ndc is not None:  # where the film spans [−1, 1] at any distance
-        pixels = side * max(film.width, film.height) / 2
-    return int(np.clip(round(math.log2(max(pixels, 2.0))), 1, 12))
-
-
-def carved_cells(
-    config: TrainConfig, dataset: Dataset, field: NeuralFieldConfig
-) -> np.ndarray[Any, Any]:
-    """The cells of the field's box that may hold something, (X, Y, Z) booleans."""
-    options = config.occupancy
-    if options.hull:
-        return hull.carve(dataset, field.lower, field.upper, options.resolution)
-    return np.ones(grid_shape(field.lower, field.upper, options.resolution), bool)
-
-
 def _require_memory(config: TrainConfig) -> None:
     """Refuses steps whose samples alone would not fit in memory."""
     sampling = config.sampling
@@ -119,12 +62,50 @@ def _require_memory(config: TrainConfig) -> None:
         )
 
 
-def _rows(values: Any, part: tuple[int, int], count: int) -> Any:
-    """The ``count`` values of each ray of a part."""
-    if len(values) == part[1] * count:
-        return values
-    index = dr.arange(dr.uint32_array_t(type(values)), part[1] * count)
-    return dr.gather(type(values), values, index + dr.opaque(type(index), part[0] * count))
+@dataclass
+class _Drawn:
+    """The rays of a step, or some of them, and where in their strata samples lie."""
+
+    batch: RayBatch
+    jitter: Any  # of every ray's samples, in [0, 1)
+    fine_jitter: Any  # of those that the coarse network places; none without
+
+    @property
+    def rays(self) -> int:
+        """How many."""
+        return len(self.batch.alpha)
+
+    def part(self, start: int, rays: int) -> _Drawn:
+        """``rays`` of the rays, from number ``start`` on."""
+
+        def rows(values: Any) -> Any:
+            count = len(values) // self.rays
+            if rays == self.rays or not count:
+                return values
+            index = dr.arange(dr.uint32_array_t(type(values)), rays * count)
+            return dr.gather(type(values), values, index + dr.opaque(type(index), start * count))
+
+        return _Drawn(self.batch.part(start, rays), rows(self.jitter), rows(self.fine_jitter))
+
+
+@dataclass
+class _Part:
+    """What some rays of a step came to; arrays hold one value each."""
+
+    loss: Any  # their share of the step's
+    mse: Any  # of the fine network, likewise
+    rays: Any  # that counted
+    queries: int  # made
+    wanted: int  # queries that all of the rays would need
+
+    def __add__(self, other: _Part) -> _Part:
+        return _Part(
+            self.loss + other.loss,
+            self.mse + other.mse,
+            self.rays + other.rays,
+            self.queries + other.queries,
+            self.wanted + other.wanted,
+        )
 
 
 class Trainer:
@@ -211,9 +192,29 @@ class Trainer:
 
     def step(self, learning_rate: float) -> StepResult:
         """One optimisation step. Launches work; reads nothing back but sample counts."""
-        config, float_type = self.config, self._backend.Float
+        drawn = self._draw()
+        found = self._differentiate(drawn)
+        accepted = self._update(learning_rate, found.loss)
+        self._adapt_rays(drawn.rays, found.wanted)
+        return StepResult(found.loss, found.mse, accepted, found.rays, found.queries)
+
+    def validate(self, batch: RayBatch, field: Field | None = None) -> float:
+        """The loss over the pixels of ``batch``, by this field or another; changes nothing."""
+        march = replace(self.march_settings(), hidden=0.0, fine=self.config.sampling.fine)
+        with dr.suspend_grad():
+            seen = render_rays(
+                MarchedField(field or self.field, march, self.occupancy), batch.o, batch.d
+            )
+            predicted = over_background(seen.color, seen.opacity, batch.background)
+            target = over_background(batch.color, batch.alpha, batch.background)
+            return float(dr.mean(self._loss(predicted, target))[0])
+
+    # ---------------------------- The phases of a step ------------------------------
+
+    def _draw(self) -> _Drawn:
+        """Random rays and offsets of their samples, which follow from seed and step alone."""
+        config, float_type, rays = self.config, self._backend.Float, self._ray_count()
         rng = step_rng(float_type, config.seed, self.step_count)
-        rays = self._ray_count()
         crop = config.crop if self.step_count < config.crop_steps else 1.0
         fine = config.sampling.fine
         with stage("rays"):
@@ -221,33 +222,34 @@ class Trainer:
             jitter = rng.random(float_type, rays * config.sampling.samples)
             fine_jitter = rng.random(float_type, rays * fine) if fine else float_type()
             dr.eval(jitter, fine_jitter)
+        return _Drawn(batch, jitter, fine_jitter)
+
+    def _differentiate(self, drawn: _Drawn) -> _Part:
+        """Sets the gradients of all parameters to those of the loss, part by part."""
         self.optimizer.zero_grad()
         with self._networks_in_training():
             parts = [
-                self._differentiate(batch.part(*part), part, rays, jitter, fine_jitter)
-                for part in self._parts(rays)
+                self._differentiate_part(drawn.part(start, size), size / drawn.rays)
+                for start, size in self._parts(drawn.rays)
             ]
-        loss, mse, counted = (sum(v[1:], v[0]) for v in list(zip(*parts, strict=True))[:3])
+        return sum(parts[1:], parts[0])
+
+    def _update(self, learning_rate: float, loss: Any) -> Any:
+        """Moves the parameters, unless loss or gradients are not finite, and the occupancy.
+
+        Returns:
+            A mask of one element: whether the parameters moved.
+        """
         with stage("optimizer"):
             accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
             if self.loss_scale is not None:
                 self.loss_scale.update(accepted)
         self.step_count += 1
-        self._adapt_rays(rays, sum(part[4] for part in parts))
         with stage("occupancy"):
             self._refresh_occupancy()
-        return StepResult(loss, mse, accepted, counted, sum(part[3] for part in parts))
+        return accepted
 
-    def validate(self, batch: RayBatch, field: Field | None = None) -> float:
-        """The loss over the pixels of ``batch``, by this field or another; changes nothing."""
-        march = replace(self.march_settings(), hidden=0.0, fine=self.config.sampling.fine)
-        with dr.suspend_grad():
-            seen = render_rays(
-                field or self.field, batch.o, batch.d, march, occupancy=self.occupancy
-            )
-            predicted = over_background(seen.color, seen.opacity, batch.background)
-            target = over_background(batch.color, batch.alpha, batch.background)
-            return float(dr.mean(self._loss(predicted, target))[0])
+    # ------------------------------ Differentiation ---------------------------------
 
     def _parts(self, rays: int) -> Iterator[tuple[int, int]]:
         """Ranges of rays whose activations fit together in the memory set aside for them."""
@@ -277,33 +279,13 @@ class Trainer:
             for network in networks:
                 network.noise = network.loss_scale = None
 
-    def _differentiate(
-        self, batch: RayBatch, part: tuple[int, int], rays: int, jitter: Any, fine_jitter: Any
-    ) -> tuple[Any, Any, Any, int, int]:
-        """Gradients of the loss over some of the step's rays are added to the parameters'.
-
-        Args:
-            batch: the rays of this part.
-            part: number of the first one, and how many.
-            rays: those of the whole step.
-            jitter, fine_jitter: for all samples of the step.
-
-        Returns:
-            This part of the loss and of the squared error of the fine network, rays that
-            counted, queries made, and queries that all of its rays would need.
-        """
-        sampling, share = self.config.sampling, part[1] / rays
+    def _differentiate_part(self, drawn: _Drawn, share: float) -> _Part:
+        """Adds the gradients of the loss over ``share`` of the step's rays to the parameters'."""
+        sampling, batch, march = self.config.sampling, drawn.batch, self.march_settings()
         budget = math.ceil(sampling.batch * share)
-        march = self.march_settings()
         with stage("samples"):
-            samples = place_samples(
-                self.field,
-                batch.o,
-                batch.d,
-                march,
-                occupancy=self.occupancy,
-                jitter=_rows(jitter, part, sampling.samples),
-            )
+            marched = MarchedField(self.field, march, self.occupancy)
+            samples = place_samples(marched, batch.o, batch.d, jitter=drawn.jitter)
         wanted = samples.queries
         complete = samples.truncate(budget)
         queries, passes = samples.queries, []
@@ -311,8 +293,7 @@ class Trainer:
             coarse = self._evaluate(self.field.coarse, samples)
             with stage("compositing"):
                 passes.append((coarse, integrate(coarse, samples)))
-            offsets = _rows(fine_jitter, part, sampling.fine)
-            weights, fine = passes[0][1].weights, sampling.fine
+            weights, fine, offsets = passes[0][1].weights, sampling.fine, drawn.fine_jitter
             with stage("samples"):
                 samples = refine(samples, weights, fine, self.occupancy, offsets, march.hidden)
             wanted += samples.queries
@@ -329,7 +310,7 @@ class Trainer:
         with stage("network"):
             for evaluation, _ in passes:
                 evaluation.backward()
-        return loss, mse, complete, queries, wanted
+        return _Part(loss, mse, complete, queries, wanted)
 
     def _evaluate(self, field: NeuralField, samples: Samples) -> Evaluation:
         """With two networks, each evaluates its share of the batch, filled up but little."""

@@ -25,6 +25,7 @@ from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.cameras.pinhole import sensor_dict
 from mi_nerf.data import load_dataset
 from mi_nerf.images.metrics import psnr, to_8bit
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.view import display_image, render_view
 from mi_nerf.tasks.evaluate import reference_image
@@ -70,7 +71,9 @@ def _quality(run: training.Run, data: Path, views: int) -> None:
     for name, (grid, settings) in ways.items():
         found, queries = [], 0
         for k, pose in enumerate(dataset.cam_to_world):
-            view = render_view(field, dataset.intrinsics, pose, settings, backend, occupancy=grid)
+            view = render_view(
+                MarchedField(field, settings, grid), dataset.intrinsics, pose, backend
+            )
             image = to_8bit(display_image(view, field.color_space))
             found.append(psnr(image, reference_image(dataset, k)))
             queries += view.queries

@@ -25,10 +25,11 @@ import numpy as np
 
 from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.data import load_dataset
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import Rule, over_background
+from mi_nerf.march.quadrature import integrate, over_background
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
+from mi_nerf.march.rules import Rule
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.tasks.target import open_target
 from mi_nerf.training.batches import RayBatch, RaySource, step_rng
@@ -190,7 +191,7 @@ def _image(
         offsets = backend.Float(rng.random(count, np.float32)) if jitter else None
         with dr.suspend_grad():
             placed = place_samples(
-                field, part.o, part.d, march, occupancy=occupancy, jitter=offsets
+                MarchedField(field, march, occupancy), part.o, part.d, jitter=offsets
             )
             seen = integrate(Evaluation(field, placed, march.block), placed)
             parts.append(np.array(over_background(seen.color, seen.opacity, part.background)))

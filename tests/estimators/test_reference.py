@@ -12,6 +12,7 @@ from mi_nerf.cameras.ndc import Ndc
 from mi_nerf.estimators.reference import Reference, reference
 from mi_nerf.fields.closed_form import closed_form
 from mi_nerf.fields.neural import NeuralField
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
@@ -65,7 +66,9 @@ def test_far_better_than_quadrature(ad: Any, kind: str, values: dict[str, Any]) 
     found = reference(field, o, d, max_intervals=1 << 13)
     error = np.abs(numbers(found) - exact)
     assert (error <= found.error + 1e-7).all()
-    quadrature = np.abs(numbers(render_rays(field, o, d, MarchSettings(samples=64))) - exact)
+    quadrature = np.abs(
+        numbers(render_rays(MarchedField(field, MarchSettings(samples=64)), o, d)) - exact
+    )
     for channels in (slice(3, 4), slice(4, 5)):
         rms, coarse = (np.sqrt(np.mean(e[:, channels] ** 2)) for e in (error, quadrature))
         assert rms < 1e-7 or rms < 0.02 * coarse
@@ -97,7 +100,8 @@ def test_differences_alone_would_be_fooled(ad: Any) -> None:
     o, d = np.array([[0.1, 0.2, -3.0]]), np.array([[0.0, 0.0, 1.0]])
     rays = [vectors(ad, v, "64") for v in (o, d)]
     marches = [
-        np.array(render_rays(field, *rays, MarchSettings(samples=n)).opacity) for n in (256, 1024)
+        np.array(render_rays(MarchedField(field, MarchSettings(samples=n)), *rays).opacity)
+        for n in (256, 1024)
     ]
     exact = oracle.seen("step", oracle.values_of(field.config), within(field, o, d))[0, 3]
     found = reference(field, *rays, max_intervals=1024)
@@ -133,7 +137,9 @@ def test_learned_field(ad: Any) -> None:
     found = reference(field, vectors(ad, o), vectors(ad, d))
     double = NeuralField.create(SMALL, 3, ad.TensorXf64)
     settings = MarchSettings(samples=4096)
-    exact = numbers(render_rays(double, vectors(ad, o, "64"), vectors(ad, d, "64"), settings))
+    exact = numbers(
+        render_rays(MarchedField(double, settings), vectors(ad, o, "64"), vectors(ad, d, "64"))
+    )
     error = np.abs(numbers(found) - exact)
     assert exact[:, 3].max() > 0.5
     assert (error <= found.error + 1e-6).all() and found.error[:, :4].max() < 2e-5

@@ -17,9 +17,11 @@ from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.cli import main
 from mi_nerf.fields.closed_form import CLOSED_FORMS, ClosedFormField, closed_form
 from mi_nerf.fields.protocol import Field
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate, render_rays
+from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
 from tests.support import closed_forms as oracle
 from tests.support.arrays import unit, vectors
@@ -261,7 +263,9 @@ def quadrature_errors(
     field = closed_form(kind, values, ad.TensorXf64)
     o, d = directed(count)
     image = render_rays(
-        field, vectors(ad, o, "64"), vectors(ad, d, "64"), MarchSettings(samples=samples)
+        MarchedField(field, MarchSettings(samples=samples)),
+        vectors(ad, o, "64"),
+        vectors(ad, d, "64"),
     )
     found = np.array([*map(np.array, image.color), np.array(image.opacity), np.array(image.depth)])
     exact = oracle.seen(kind, oracle.values_of(field.config), within(field, o, d)).T
@@ -293,7 +297,7 @@ def test_jumps_converge_with_the_step(ad: Any, kind: str) -> None:
 def gradient(ad: Any, field: ClosedFormField, mix: np.ndarray, samples: int) -> np.ndarray:
     """Derivatives with respect to all numbers of a loss that weighs all outputs of all rays."""
     o, d = (vectors(ad, v, "64") for v in directed(mix.shape[1]))
-    placed = place_samples(field, o, d, MarchSettings(samples=samples))
+    placed = place_samples(MarchedField(field, MarchSettings(samples=samples)), o, d)
     for tensor in field.parameters().values():
         dr.enable_grad(tensor)
         dr.clear_grad(tensor)

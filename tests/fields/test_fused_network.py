@@ -13,6 +13,7 @@ from mi_nerf.fields.fourier import FourierEncoding
 from mi_nerf.fields.hash_grid import HashGridConfig
 from mi_nerf.fields.network import NetworkConfig
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.placing import place_samples
 from mi_nerf.march.query import Evaluation
@@ -70,10 +71,10 @@ def test_new_weights_are_seen() -> None:
     """A rendering always asks the weights of its own time."""
     field = NeuralField.create(BASE, 0, ad.TensorXf)
     o, d = vectors(ad, [(0.1, -3, 0.2)]), vectors(ad, [(0, 1, 0)])
-    before = np.array(render_rays(field, o, d, MarchSettings()).opacity)
+    before = np.array(render_rays(MarchedField(field, MarchSettings()), o, d).opacity)
     for name, tensor in field.parameters().items():
         field.parameters()[name] = type(tensor)(np.array(tensor) * 2)
-    after = np.array(render_rays(field, o, d, MarchSettings()).opacity)
+    after = np.array(render_rays(MarchedField(field, MarchSettings()), o, d).opacity)
     assert abs(before[0] - after[0]) > 1e-3
 
 
@@ -81,7 +82,7 @@ def test_gradients_do_not_take_the_short_way() -> None:
     field: Any = NeuralField.create(BASE, 0, ad.TensorXf)
     grid = OccupancyGrid(field.lower, field.upper, np.ones((4, 4, 4), bool), ad.Float)
     o, d = vectors(ad, [(0.1, -3, 0.2)]), vectors(ad, [(0, 1, 0)])
-    samples = place_samples(field, o, d, MarchSettings(samples=16), occupancy=grid)
+    samples = place_samples(MarchedField(field, MarchSettings(samples=16), grid), o, d)
     kept, short = (Evaluation(field, samples, 16, keep=keep) for keep in (True, False))
     assert kept._fused is None and short._fused is not None
     np.testing.assert_allclose(np.array(kept.density), np.array(short.density), rtol=1e-4)

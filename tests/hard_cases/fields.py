@@ -8,10 +8,11 @@ import drjit as dr
 import numpy as np
 
 from mi_nerf.fields.closed_form import closed_form
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import sample_weights
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
+from mi_nerf.march.rules import sample_weights
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.march.strata import points_along, stratified
 from tests.hard_cases import Finding, relative
@@ -39,7 +40,7 @@ class Probe:
 
     def errors(self, settings: MarchSettings) -> tuple[float, float]:
         """Relative errors of mi_nerf's opacities (of the largest) and of the derivative."""
-        samples = place_samples(self.field, self._o, self._d, settings)
+        samples = place_samples(MarchedField(self.field, settings), self._o, self._d)
         self._enable()
         evaluation = Evaluation(self.field, samples, 16384, keep=True)
         evaluation.enable_grad()

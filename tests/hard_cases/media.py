@@ -10,7 +10,8 @@ import drjit as dr
 import numpy as np
 
 from mi_nerf.fields.activations import bounded_exp
-from mi_nerf.march.quadrature import composite, one_minus_exp, sample_weights
+from mi_nerf.march.quadrature import composite
+from mi_nerf.march.rules import one_minus_exp, sample_weights
 from mi_nerf.march.strata import stratified
 from tests.hard_cases import Finding, relative
 from tests.support import naive

@@ -12,10 +12,11 @@ from mi_nerf.cameras.ndc import Ndc
 from mi_nerf.fields.closed_form import closed_form
 from mi_nerf.march.importance import inverse_transform
 from mi_nerf.march.intervals import box_interval
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import sample_weights
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
+from mi_nerf.march.rules import sample_weights
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.march.strata import points_along, stratified
 from tests.hard_cases import Finding, not_finite, relative
@@ -72,7 +73,9 @@ def sample_positions(ad: Any) -> list[Finding]:
 
     def detached(far: Any) -> Any:
         settings = MarchSettings(samples=64)
-        samples = place_samples(field, o, d, settings, jitter=jitter, bounds=(None, far))
+        samples = place_samples(
+            MarchedField(field, settings), o, d, jitter=jitter, bounds=(None, far)
+        )
         return integrate(Evaluation(field, samples, 4096), samples).opacity
 
     slopes = []

@@ -16,10 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mi_nerf.base.arrays import upload
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import Composite, sample_weights
+from mi_nerf.march.quadrature import Composite, integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
+from mi_nerf.march.rules import sample_weights
 from mi_nerf.march.samples import Samples
 from mi_nerf.march.settings import MarchSettings
 from tests.support.analytic import AnalyticField
@@ -93,10 +94,9 @@ def look(
     o = vectors(ad, (n["o"] * medium.scale).astype(np.float32))
     random = np.random.default_rng(medium.seed).random(RAYS * count, np.float32)
     samples = place_samples(
-        field,
+        MarchedField(field, MarchSettings(samples=count)),
         o,
         vectors(ad, n["d"]),
-        MarchSettings(samples=count),
         jitter=upload(ad.Float, random) if jitter else None,
     )
     evaluation = Evaluation(field, samples, 1024)

@@ -12,7 +12,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mi_nerf.march.quadrature import composite, one_minus_exp, over_background
+from mi_nerf.march.quadrature import composite, over_background
+from mi_nerf.march.rules import one_minus_exp
 from mi_nerf.march.strata import stratified
 
 

@@ -12,11 +12,11 @@ import pytest
 from mi_nerf.fields.fourier import FourierEncoding
 from mi_nerf.fields.network import NetworkConfig, initial_weights
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.placing import place_samples
-from mi_nerf.march.quadrature import Composite
+from mi_nerf.march.quadrature import Composite, integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
 from mi_nerf.march.samples import Samples
 from mi_nerf.march.settings import MarchSettings
 from tests.support.analytic import AnalyticField
@@ -38,10 +38,9 @@ def batch(ad: Any, field: NeuralField, precision: str = "64") -> Samples:
     d = unit(rng.uniform(-1.6, 1.6, (RAYS, 3)) - o)
     jitter = getattr(ad, "Float" + precision)(rng.random(RAYS * COUNT))
     return place_samples(
-        field,
+        MarchedField(field, MarchSettings(samples=COUNT)),
         vectors(ad, o, precision),
         vectors(ad, d, precision),
-        MarchSettings(samples=COUNT),
         jitter=jitter,
     )
 
@@ -183,7 +182,7 @@ def test_colour_made_of_density(ad: Any, mode: str) -> None:
         field.lower, field.upper, np.array([False, True, True]).reshape(1, 1, 3), ad.Float64
     )
     o, d = vectors(ad, [(0, 0, -3)], "64"), vectors(ad, [(0, 0, 1)], "64")
-    samples = place_samples(field, o, d, MarchSettings(samples=3), occupancy=grid)
+    samples = place_samples(MarchedField(field, MarchSettings(samples=3), grid), o, d)
     dr.enable_grad(sigma)
     dr.set_grad(sigma, 1 if mode == "forward" else 0)
     evaluation = Evaluation(field, samples, 8)
@@ -210,7 +209,7 @@ def test_sample_positions_carry_no_gradient(ad: Any) -> None:
     o, d = vectors(ad, [(0, 0, -3)], "64"), vectors(ad, [(0, 0, 1)], "64")
     far = ad.Float64(3.5)
     dr.enable_grad(o, d, far)
-    samples = place_samples(field, o, d, MarchSettings(samples=4), bounds=(None, far))
+    samples = place_samples(MarchedField(field, MarchSettings(samples=4)), o, d, bounds=(None, far))
     assert not dr.grad_enabled(samples.t, samples.delta)
 
 

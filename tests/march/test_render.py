@@ -14,10 +14,12 @@ from mi_nerf.fields.fourier import FourierEncoding
 from mi_nerf.fields.network import NetworkConfig
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
 from mi_nerf.march import query
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import RayImage, integrate, ray_chunks, render_rays
+from mi_nerf.march.render import RayImage, ray_chunks, render_rays
 from mi_nerf.march.settings import MarchSettings
 from tests.support.analytic import AnalyticField, ball, gaussian, uniform
 from tests.support.arrays import unit, vectors
@@ -57,10 +59,10 @@ def render(
     ad: Any, field: Any, rays: tuple[np.ndarray, np.ndarray], samples: int = 64, **options: Any
 ) -> np.ndarray:
     """What :func:`render_rays` sees, (5, N); options are settings, occupancy or jitter."""
-    more = {k: options.pop(k) for k in ("occupancy", "jitter") if k in options}
+    grid, jitter = options.pop("occupancy", None), options.pop("jitter", None)
     settings = MarchSettings(samples=samples, **options)
     o, d = vectors(ad, rays[0]), vectors(ad, rays[1])
-    return image(render_rays(field, o, d, settings, **more))
+    return image(render_rays(MarchedField(field, settings, grid), o, d, jitter=jitter))
 
 
 # ---- Closed forms -----------------------------------------------------------
@@ -150,10 +152,9 @@ def test_from_inside_and_between_bounds(ad: Any) -> None:
 def test_bounds_of_single_rays(ad: Any) -> None:
     o, d = vectors(ad, [(0, 0, -3)] * 3), vectors(ad, [(0, 0, 1)] * 3)
     samples = place_samples(
-        AnalyticField(uniform(1.0)),
+        MarchedField(AnalyticField(uniform(1.0)), MarchSettings(samples=2)),
         o,
         d,
-        MarchSettings(samples=2),
         bounds=(ad.Float([0, 2.5, 3]), ad.Float([9, 3.5, 2.5])),
     )
     assert list(samples.delta) == [1, 1, 0.5, 0.5, 0, 0]
@@ -204,7 +205,7 @@ def test_other_numbers_of_queries_reuse_the_kernels(ad: Any) -> None:
 
     def kernels(far: float) -> tuple[int, set[str]]:
         settings = MarchSettings(samples=8, far=far)
-        samples = place_samples(field, o, d, settings)
+        samples = place_samples(MarchedField(field, settings), o, d)
         dr.eval(samples)
         dr.sync_thread()
         dr.kernel_history_clear()
@@ -221,7 +222,11 @@ def test_other_numbers_of_queries_reuse_the_kernels(ad: Any) -> None:
 
 def test_one_origin_for_all_rays(ad: Any) -> None:
     field, (o, d) = AnalyticField(uniform(1.0), None, *BOX), make_rays(20)
-    shared = image(render_rays(field, vectors(ad, o[:1]), vectors(ad, d), MarchSettings(samples=4)))
+    shared = image(
+        render_rays(
+            MarchedField(field, MarchSettings(samples=4)), vectors(ad, o[:1]), vectors(ad, d)
+        )
+    )
     assert np.array_equal(shared, render(ad, field, (np.repeat(o[:1], 20, 0), d), samples=4))
 
 
@@ -249,8 +254,8 @@ def test_empty_cells_are_not_evaluated(ad: Any) -> None:
     grid.restore({**grid.state(), "mask": touched})
 
     o, d = (vectors(ad, v) for v in make_rays(100))
-    full = render_rays(field, o, d, MarchSettings())
-    sparse = render_rays(field, o, d, MarchSettings(), occupancy=grid)
+    full = render_rays(MarchedField(field, MarchSettings()), o, d)
+    sparse = render_rays(MarchedField(field, MarchSettings(), grid), o, d)
     assert np.array_equal(image(sparse), image(full))
     assert image(full)[3].max() > 0.99
     assert sparse.queries < 0.2 * full.queries
@@ -269,12 +274,12 @@ def test_empty_grid(ad: Any) -> None:
 def test_all_rays_miss(ad: Any) -> None:
     field = NeuralField.create(SMALL, 0, ad.TensorXf)
     o, d = vectors(ad, [(9, 9, 9)] * 3), vectors(ad, [(1, 0, 0)] * 3)
-    result = render_rays(field, o, d, MarchSettings(samples=4))
+    result = render_rays(MarchedField(field, MarchSettings(samples=4)), o, d)
     assert image(result).shape == (5, 3) and not image(result).any()
     assert result.queries == 0
     # A step of training on such rays has no gradient, and no complaint.
     dr.enable_grad(field.parameters())
-    samples = place_samples(field, o, d, MarchSettings(samples=4))
+    samples = place_samples(MarchedField(field, MarchSettings(samples=4)), o, d)
     evaluation = Evaluation(field, samples, 16)
     evaluation.enable_grad()
     seen = integrate(evaluation, samples)
@@ -285,7 +290,7 @@ def test_all_rays_miss(ad: Any) -> None:
 
 def test_no_rays(ad: Any) -> None:
     none = dr.zeros(ad.Array3f, 0)
-    result = render_rays(AnalyticField(uniform(1.0)), none, none, MarchSettings())
+    result = render_rays(MarchedField(AnalyticField(uniform(1.0)), MarchSettings()), none, none)
     assert image(result).shape == (5, 0) and result.queries == 0
 
 
@@ -324,8 +329,8 @@ def test_early_termination_keeps_its_bound(ad: Any, stop: float) -> None:
     field = AnalyticField(gaussian((0, 0, 0), 0.3, 40.0), lambda p, d: [1.0, 3.0, 0.5 + 0 * p.x])
     rays = make_rays(150, seed=4)
     o, d = (vectors(ad, v) for v in rays)
-    dense = render_rays(field, o, d, MarchSettings())
-    short = render_rays(field, o, d, MarchSettings(stop=stop))
+    dense = render_rays(MarchedField(field, MarchSettings()), o, d)
+    short = render_rays(MarchedField(field, MarchSettings(stop=stop)), o, d)
     lost = image(dense) - image(short)
     limit = np.array([1, 3, 0.5, 1])[:, None] * stop + 2e-6
     assert (np.abs(lost[:4]) <= limit).all()
@@ -340,8 +345,8 @@ def test_a_ray_ends_where_nothing_shows_any_more(ad: Any) -> None:
     field = AnalyticField(uniform(1e4), None, *BOX)
     hits = int((np.diff(slow_interval(*rays, *BOX))[:, 0] > 0).sum())
     o, d = (vectors(ad, v) for v in rays)
-    assert render_rays(field, o, d, MarchSettings(stop=1e-4)).queries == 4 * hits
-    assert render_rays(field, o, d, MarchSettings()).queries == 128 * hits
+    assert render_rays(MarchedField(field, MarchSettings(stop=1e-4)), o, d).queries == 4 * hits
+    assert render_rays(MarchedField(field, MarchSettings()), o, d).queries == 128 * hits
 
 
 def test_few_rays_are_asked_for_more_at_once(ad: Any) -> None:
@@ -350,12 +355,12 @@ def test_few_rays_are_asked_for_more_at_once(ad: Any) -> None:
     hits = int((np.diff(slow_interval(*rays, *BOX))[:, 0] > 0).sum())
     o, d = (vectors(ad, v) for v in rays)
     field = AnalyticField(uniform(1e4), None, *BOX)
-    assert render_rays(field, o, d, MarchSettings(stop=1e-4)).queries == 128 * hits
+    assert render_rays(MarchedField(field, MarchSettings(stop=1e-4)), o, d).queries == 128 * hits
 
 
 def test_rays_that_see_nothing_have_no_rounds(ad: Any) -> None:
     o, d = vectors(ad, [(5, 5, 5)] * 3), vectors(ad, [(0, 0, 1)] * 3)
-    seen = render_rays(AnalyticField(uniform(1.0)), o, d, MarchSettings(stop=1e-4))
+    seen = render_rays(MarchedField(AnalyticField(uniform(1.0)), MarchSettings(stop=1e-4)), o, d)
     assert seen.queries == 0 and not image(seen).any()
 
 
@@ -384,7 +389,7 @@ def test_hidden_samples_are_left_out(ad: Any) -> None:
 
     def look(hidden: float) -> RayImage:
         settings = MarchSettings(samples=64, hidden=hidden)
-        return render_rays(field, o, d, settings, occupancy=grid)
+        return render_rays(MarchedField(field, settings, grid), o, d)
 
     assert look(5.0).queries == look(0.0).queries  # nothing was seen yet
     for turn in range(60):

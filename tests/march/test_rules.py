@@ -18,14 +18,18 @@ from mi_nerf import load_field, save_field
 from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.data import load_dataset
 from mi_nerf.fields.closed_form import closed_form
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples, refine
-from mi_nerf.march.quadrature import composite, linear_weights, mean_transmittance, sample_weights
+from mi_nerf.march.quadrature import composite, integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate, render_rays
+from mi_nerf.march.render import render_rays
+from mi_nerf.march.rules import RULES as BY_NAME
+from mi_nerf.march.rules import linear_weights, mean_transmittance, sample_weights
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.march.strata import cell_widths, stratified
 from mi_nerf.training.trainer import Trainer
 from tests.support import closed_forms as oracle
+from tests.support.analytic import AnalyticField, uniform
 from tests.support.arrays import unit, vectors
 from tests.support.fields import scene_dict, small_file
 from tests.training.test_run import small
@@ -33,6 +37,7 @@ from tests.training.test_run import small
 VARIANT = choose_variant()
 AD = array_module(VARIANT)
 RULES = ("constant", "cells", "linear")
+LINEAR = BY_NAME["linear"]
 every_rule = pytest.mark.parametrize("rule", RULES)
 
 
@@ -100,7 +105,7 @@ def test_any_medium(ad: Any, exponents: list[float], seed: int, scale: float) ->
     leaves = [ad.Float(density), *(ad.Float(channel) for channel in emission)]
     dr.enable_grad(leaves)
     ends = ad.Float(near), ad.Float(far)
-    seen = composite(leaves[0], leaves[1:], ad.Float(t.ravel()), None, SAMPLES, ends)
+    seen = composite(leaves[0], leaves[1:], ad.Float(t.ravel()), None, SAMPLES, LINEAR, ends)
     weights, opacity = np.array(seen.weights).reshape(RAYS, -1), np.array(seen.opacity)
     assert (weights >= 0).all() and (opacity >= 0).all() and (opacity <= 1).all()
     assert weights.sum(axis=1, dtype=float) == pytest.approx(opacity, rel=1e-5, abs=1e-30)
@@ -174,7 +179,7 @@ def test_a_slab_is_exact(ad: Any, samples: int) -> None:
 
 def test_nan_is_not_hidden(ad: Any) -> None:
     t, ends = ad.Float([1, 2, 1, 2]), (ad.Float([0, 0]), ad.Float([3, 3]))
-    seen = composite(ad.Float([1, np.nan, 1, 1]), [ad.Float(1)], t, None, 2, ends)
+    seen = composite(ad.Float([1, np.nan, 1, 1]), [ad.Float(1)], t, None, 2, LINEAR, ends)
     assert np.isnan([seen.color[0][0], seen.opacity[0]]).all()
     assert np.isfinite([seen.color[0][1], seen.opacity[1]]).all()
 
@@ -194,7 +199,7 @@ def test_gradients_against_finite_differences(ad: Any) -> None:
         """One for each ray, from the 160 numbers of density and emission."""
         index = dr.arange(ad.UInt32, 40)
         values = [dr.gather(ad.Float64, x, index + 40 * i) for i in range(4)]
-        seen = composite(values[0], values[1:], ad.Float64(t), None, 10, ends)
+        seen = composite(values[0], values[1:], ad.Float64(t), None, 10, LINEAR, ends)
         outputs = [*seen.color, seen.opacity, seen.depth]
         return sum(ad.Float64(m) * output for m, output in zip(mix, outputs, strict=True))
 
@@ -215,7 +220,7 @@ def test_gradient_in_empty_space(ad: Any) -> None:
     density, t = dr.zeros(ad.Float, 3), ad.Float([1, 2, 4])
     dr.enable_grad(density)
     ends = ad.Float(0), ad.Float(5)
-    seen = composite(density, [ad.Float([1, 2, 3])], t, None, 3, ends)
+    seen = composite(density, [ad.Float([1, 2, 3])], t, None, 3, LINEAR, ends)
     dr.backward(seen.color[0])
     assert list(dr.grad(density)) == pytest.approx([1.5 * 1, 1.5 * 2, 2 * 3])
 
@@ -227,7 +232,7 @@ def test_gradients_around_an_opaque_wall(ad: Any, wall: float) -> None:
     color = ad.Float([1.0, 1.0, 0.25, 0.0, 8.0])
     dr.enable_grad(density, color)
     ends = ad.Float(0.5), ad.Float(5.5)
-    seen = composite(density, [color], ad.Float([1, 2, 3, 4, 5]), None, 5, ends)
+    seen = composite(density, [color], ad.Float([1, 2, 3, 4, 5]), None, 5, LINEAR, ends)
     dr.backward(seen.color[0])
     slopes = np.array([np.array(dr.grad(density)), np.array(dr.grad(color))])
     assert np.isfinite(slopes).all()
@@ -261,7 +266,7 @@ def errors(
     march = MarchSettings(samples=samples, rule=rule)
     rays = vectors(ad, o, "64"), vectors(ad, d, "64")
     offsets = ad.Float64(rng.random(200 * samples)) if jitter else None
-    placed = place_samples(field, *rays, march, jitter=offsets)
+    placed = place_samples(MarchedField(field, march), *rays, jitter=offsets)
     seen = integrate(Evaluation(field, placed, 1 << 16), placed)
     v, lines = oracle.values_of(field.config), oracle.Rays.in_box(o, d, field.lower, field.upper)
     found = np.array([np.array(seen.opacity), np.array(seen.depth)])
@@ -315,7 +320,7 @@ def test_the_unit_of_length_does_not_matter(ad: Any, rule: str, scale: float) ->
         o, d = vectors(ad, [(s, 2 * s, 0)] * 50), unit([(-1, -2, 0.02 * i) for i in range(50)])
         jitter = ad.Float(np.random.default_rng(0).random(50))
         march = MarchSettings(samples=40, rule=rule)
-        seen = render_rays(field, o, vectors(ad, d), march, jitter=jitter)
+        seen = render_rays(MarchedField(field, march), o, vectors(ad, d), jitter=jitter)
         images.append([np.array(seen.opacity), np.array(seen.color[0]), np.array(seen.depth) / s])
     assert images[1][0].max() > 0.5
     assert np.array(images[1]) == pytest.approx(np.array(images[0]), rel=2e-4, abs=2e-5)
@@ -329,8 +334,8 @@ def test_rays_that_end_early(ad: Any, rule: str) -> None:
     d = unit(np.random.default_rng(3).normal(size=(64, 3)) - (0, 0, 3))
     rays = vectors(ad, [(0, 0, 0.9)] * 64), vectors(ad, d)
     march = MarchSettings(samples=64, rule=rule)
-    all_of_it = render_rays(field, *rays, march)
-    ended = render_rays(field, *rays, replace(march, stop=0.01))
+    all_of_it = render_rays(MarchedField(field, march), *rays)
+    ended = render_rays(MarchedField(field, replace(march, stop=0.01)), *rays)
     assert ended.queries < 0.8 * all_of_it.queries
     lost = np.array(all_of_it.opacity) - np.array(ended.opacity)
     assert (np.abs(lost) < 0.01).all() and lost.max() > 1e-6
@@ -342,13 +347,32 @@ def test_rays_that_end_early(ad: Any, rule: str) -> None:
 def test_refined_samples_keep_the_rule(ad: Any) -> None:
     field = closed_form("gaussian", {}, ad.TensorXf)
     o, d = vectors(ad, [(0, 0, -3)]), vectors(ad, [(0, 0, 1)])
-    first = place_samples(field, o, d, MarchSettings(samples=8, rule="linear"))
+    first = place_samples(MarchedField(field, MarchSettings(samples=8, rule="linear")), o, d)
     more = refine(first, integrate(Evaluation(field, first, 64), first).weights, 24)
     found = integrate(Evaluation(field, more, 64), more)
     expected, _ = linear_weights(
         Evaluation(field, more, 64).density, more.t, more.near, more.far, 32
     )
     assert np.array(found.weights) == pytest.approx(np.array(expected))
+
+
+@every_rule
+@pytest.mark.parametrize("fine", [0, 16])
+def test_widths_are_those_between_the_ends(rule: str, fine: int) -> None:
+    """Also of samples refined, which lie in no equal strata any more; near the origin."""
+    field, rng = AnalyticField(uniform(1.0)), np.random.default_rng(3)
+    o, d = vectors(AD, np.full((9, 3), 0.1)), vectors(AD, unit(rng.normal(size=(9, 3))))
+    march = MarchSettings(samples=12, rule=rule)
+    placed = place_samples(MarchedField(field, march), o, d, jitter=AD.Float(rng.random(9 * 12)))
+    if fine:
+        placed = refine(placed, AD.Float(rng.random(9 * 12)), fine)
+    ends = np.array(placed.edges()).reshape(9, 13 + fine)
+    t, delta = (np.array(x).reshape(9, 12 + fine) for x in (placed.t, placed.delta))
+    assert np.diff(ends) == pytest.approx(delta, abs=1e-6)
+    assert np.all((ends[:, :-1] <= t) & (t <= ends[:, 1:]))
+    assert ends[:, 0] == pytest.approx(placed.near.numpy()) and delta.min() >= 0
+    equal = delta == pytest.approx(np.broadcast_to(delta[:, :1], delta.shape), rel=1e-5)
+    assert equal == (rule == "constant" and not fine)
 
 
 @pytest.mark.parametrize("rule", ["cells", "linear"])

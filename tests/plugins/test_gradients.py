@@ -13,9 +13,10 @@ import pytest
 
 import mi_nerf
 from mi_nerf.fields.neural import NeuralField
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples
+from mi_nerf.march.quadrature import integrate
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate
 from tests.support.fields import scene_dict, small_file, weight_keys
 
 SEED = 7
@@ -63,7 +64,7 @@ def camera_rays(scene: Any, float_type: Any, vector_type: Any) -> tuple[Any, Any
 
 def loss_of(field: Any, rays: Any, contents: Any, pull: Any, keep: Any = None) -> Any:
     """Σ pull · (R, G, B, opacity, depth) by the trainer's own functions."""
-    samples = place_samples(field, *rays, contents.march)
+    samples = place_samples(MarchedField(field, contents.march), *rays)
     evaluation = Evaluation(field, samples, 4096, keep=True)
     evaluation.enable_grad()
     seen = integrate(evaluation, samples)

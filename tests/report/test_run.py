@@ -19,6 +19,7 @@ from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.cameras.ndc import Ndc
 from mi_nerf.cameras.pinhole import Intrinsics
 from mi_nerf.cli import main
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.report.view_dependence import (
     draw_view_dependence,
@@ -97,13 +98,13 @@ def test_points_lie_on_what_cameras_see() -> None:
     field = AnalyticField(ball(0.5, 1000.0))
     camera = Intrinsics.from_angle_x(32, 32, 0.5)
     march = MarchSettings(samples=512)
-    points = find_points(field, None, camera, orbit_poses(6), march, BACKEND, count=4)
+    points = find_points(MarchedField(field, march), camera, orbit_poses(6), BACKEND, count=4)
     assert np.linalg.norm(points, axis=1) == pytest.approx(0.5, abs=0.01)
     apart = np.linalg.norm(points[:, None] - points, axis=-1) + 9 * np.eye(4)
     assert apart.min() > 0.4
     empty = AnalyticField(ball(0.5, 0.0))
     with pytest.raises(InputError, match="expected points"):
-        find_points(empty, None, camera, orbit_poses(6), march, BACKEND)
+        find_points(MarchedField(empty, march), camera, orbit_poses(6), BACKEND)
 
 
 def test_deviation_measures_view_dependence(tmp_path: Path) -> None:

@@ -21,6 +21,7 @@ from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.cli import main
 from mi_nerf.fields.closed_form import closed_form
 from mi_nerf.fields.neural import NeuralField
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
@@ -118,21 +119,21 @@ def test_grids_of_a_ball(ad: Any) -> None:
 
 def subject_of(field: Any, march: MarchSettings, rays: int = 64) -> Any:
     base = open_subject("slab", VARIANT, rays=rays, views=1)
-    return replace(base, formula=False, field=field, march=march)
+    return replace(base, formula=False, marched=MarchedField(field, march))
 
 
 def test_every_setting_once_and_the_own_first() -> None:
     subject = open_subject("slab", VARIANT, rays=8)
     found = settings_of(subject, Knobs())
-    assert list(found)[0] == Setting(subject.march)
-    assert set(found[Setting(subject.march)]) == {"own", "samples", "stop"}
+    assert list(found)[0] == Setting(subject.marched.settings)
+    assert set(found[Setting(subject.marched.settings)]) == {"own", "samples", "stop"}
     by_knob = [[s for s, names in found.items() if k in names] for k in ("samples", "stop")]
     assert [len(s) for s in by_knob] == [12, 5]
     for setting, names in found.items():
         if "stop" in names:
-            assert replace(setting.march, stop=0.0) == subject.march
+            assert replace(setting.march, stop=0.0) == subject.marched.settings
         if "threshold" in names:
-            assert setting.grid is not None and setting.march == subject.march
+            assert setting.grid is not None and setting.march == subject.marched.settings
 
 
 def test_splits_make_equally_many_queries() -> None:
@@ -143,7 +144,7 @@ def test_splits_make_equally_many_queries() -> None:
     found = settings_of(subject, Knobs(samples=(4,), rules=("constant",), splits=(0, 0.125, 0.25)))
     splits = [s.march for s, names in found.items() if "split" in names]
     assert [(m.samples, m.fine) for m in splits] == [(8, 16), (32, 0), (4, 24)]
-    asked = {render_rays(field, subject.o, subject.d, m).queries for m in splits}
+    asked = {render_rays(MarchedField(field, m), subject.o, subject.d).queries for m in splits}
     assert len(asked) == 1
     (half,) = [s.march for s in found if s.march.samples == 4 and s.march.fine == 8]
     assert half.rule == "constant"
@@ -169,7 +170,7 @@ def test_errors_are_those_against_the_oracle(kind: str, values: dict[str, Any]) 
         march = MarchSettings(**{k: point[k] for k in ("samples", "fine", "rule", "stop")})
         if point["grid"] is not None:
             continue
-        seen = render_rays(subject.field, subject.o, subject.d, march)
+        seen = render_rays(MarchedField(subject.field, march), subject.o, subject.d)
         off = {
             "color": np.transpose(seen.color) - exact[:, :3],
             "opacity": np.array(seen.opacity) - exact[:, 3],
@@ -233,7 +234,7 @@ def test_what_display_values_may_be_off_by(blob_run: Path) -> None:
     for space in ("srgb", "linear"):
         field = AnalyticField(lambda p: p[0])
         field.color_space = space
-        seen = replace(subject, field=field)
+        seen = replace(subject, marched=replace(subject.marched, field=field))
         bound = seen.shown_error(color, opacity, error)
         for _ in range(20):
             off = error * rng.uniform(-1, 1, error.shape)

@@ -18,6 +18,7 @@ from mi_nerf.base.color import linear_to_srgb
 from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.cameras.pinhole import Intrinsics
 from mi_nerf.cli import main
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.view import render_view
 from mi_nerf.tasks import evaluate as evaluation
 from tests.support.datasets import blob_images, orbit_poses, write_blender_dataset, write_exr
@@ -233,7 +234,7 @@ def test_linear_images_are_compared_in_srgb(field_space: str, tmp_path: Path) ->
     module = array_module(choose_variant())
     built, _ = contents.build(module)
     camera = Intrinsics.from_angle_x(24, 24, 0.6)
-    view = render_view(built, camera, poses[1], contents.march, module)
+    view = render_view(MarchedField(built, contents.march), camera, poses[1], module)
     assert view.opacity.max() > 0.1
     expected = view.color + 1 - view.opacity[..., None]
     if field_space == "linear":

@@ -304,8 +304,7 @@ def test_mitsuba_sees_what_evaluation_sees(space: str, tmp_path: Path) -> None:
 
     contents = load_field(path)
     backend = array_module(variant)
-    field, occupancy = contents.build(backend)
-    view = render_view(field, camera, pose, contents.march, backend, occupancy=occupancy, spp=64)
+    view = render_view(contents.marched(backend), camera, pose, backend, spp=64)
     assert view.opacity.max() > 0.3
     if space == "srgb":  # Mitsuba averages a pixel in linear space, evaluation in sRGB
         seen = encoded(seen)

@@ -21,10 +21,11 @@ from mi_nerf.training import auto, probes
 from mi_nerf.training import run as training
 from mi_nerf.training.auto import Decision, choose, fitting_batch, strata, worth_growing
 from mi_nerf.training.config import TrainConfig, with_settings
+from mi_nerf.training.model import resolved_octaves
 from mi_nerf.training.presets import preset
 from mi_nerf.training.probes import Probe, Probes
 from mi_nerf.training.run_folder import read_config
-from mi_nerf.training.trainer import Trainer, resolved_octaves
+from mi_nerf.training.trainer import Trainer
 from tests.support.datasets import blob_images, orbit_poses, write_blender_dataset
 
 VIEWS, SIZE = 20, 20

@@ -1,4 +1,4 @@
-"""Muon's updates against NumPy in double precision, and beside Adam's."""
+"""Updates of Adam and Muon against NumPy in double precision."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from mi_nerf.training.optimizer import Adam
 from mi_nerf.training.orthogonal import is_hidden, orthogonalized, update_size
+from tests.support.published import KerasAdam
 
 
 def polynomial(matrix: np.ndarray, rounds: int = 5) -> np.ndarray:
@@ -35,6 +36,42 @@ def test_singular_values_go_to_one(ad: Any, seed: int, scale: float, shape: int)
     strong = np.linalg.svd(matrix)[1] > 0.01 * np.linalg.norm(matrix)
     assert values[strong].min() > 0.6 and values.max() < 1.3
     assert np.sqrt(np.mean(found**2)) * update_size(size) == pytest.approx(0.2, rel=0.3)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    seed=st.integers(0, 2**31),
+    scale=st.floats(-6, 4),
+    beta1=st.sampled_from([0.0, 0.9]),
+    beta2=st.sampled_from([0.9, 0.99, 0.999]),
+    epsilon=st.sampled_from([1e-7, 1e-2]),
+    accepted=st.lists(st.booleans(), min_size=1, max_size=8),
+)
+def test_adam(
+    ad: Any,
+    seed: int,
+    scale: float,
+    beta1: float,
+    beta2: float,
+    epsilon: float,
+    accepted: list[bool],
+) -> None:
+    """Several steps of random gradients; those that are declined leave no trace."""
+    rng, rate = np.random.default_rng(seed), 1e-2
+    expected = {"a.weight": rng.normal(size=(3, 5)), "a.bias": rng.normal(size=3)}
+    parameters = {n: ad.TensorXf(w.astype(np.float32)) for n, w in expected.items()}
+    optimizer = Adam(parameters, beta1=beta1, beta2=beta2, epsilon=epsilon)
+    oracle = KerasAdam(beta1, beta2, epsilon)
+    for accept in accepted:
+        gradients = {n: rng.normal(size=w.shape) * 10**scale for n, w in expected.items()}
+        optimizer.zero_grad()
+        for name, g in gradients.items():
+            dr.set_grad(parameters[name], ad.TensorXf(g.astype(np.float32)))
+        assert optimizer.step(rate, ad.Bool(accept))[0] == accept
+        if accept:
+            expected = oracle.step(expected, gradients, rate)
+        for name, w in expected.items():  # 1 - beta2 keeps few digits in single precision
+            assert np.abs(np.array(parameters[name], float) - w).max() < 2e-6 + 1e-4 * rate
 
 
 def test_nothing_stays_nothing(ad: Any) -> None:

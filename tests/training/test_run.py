@@ -22,18 +22,20 @@ from mi_nerf.cameras.pinhole import project
 from mi_nerf.data import Dataset, load_dataset
 from mi_nerf.fields.neural import NeuralFieldConfig
 from mi_nerf.formats.field_file import load_field
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples, refine
-from mi_nerf.march.quadrature import over_background
+from mi_nerf.march.quadrature import integrate, over_background
 from mi_nerf.march.query import Evaluation
-from mi_nerf.march.render import integrate, render_rays
+from mi_nerf.march.render import render_rays
 from mi_nerf.training import run as training
 from mi_nerf.training.batches import step_rng
 from mi_nerf.training.config import OptimizerConfig, TrainConfig, with_settings
+from mi_nerf.training.model import resolved_octaves
 from mi_nerf.training.presets import preset
 from mi_nerf.training.run import TrainingError
 from mi_nerf.training.run_folder import read_config
 from mi_nerf.training.schedule import learning_rate
-from mi_nerf.training.trainer import Trainer, resolved_octaves
+from mi_nerf.training.trainer import Trainer
 from tests.support.datasets import write_blob_dataset
 
 SIZE, VIEWS = 20, 6
@@ -107,7 +109,9 @@ def test_incomplete_rays_do_not_count(views: Dataset) -> None:
     rng = step_rng(ad.Float, config.seed, 0)
     batch = cut._source.draw(64, rng)
     jitter = rng.random(ad.Float, 64 * config.sampling.samples)
-    samples = place_samples(cut.field, batch.o, batch.d, cut.march_settings(), jitter=jitter)
+    samples = place_samples(
+        MarchedField(cut.field, cut.march_settings()), batch.o, batch.d, jitter=jitter
+    )
     complete = int(samples.truncate(700)[0])
     assert 0 < complete < 64
     seen = integrate(Evaluation(cut.field, samples, 1024), samples)
@@ -383,9 +387,9 @@ def test_the_field_file_takes_the_occupancy_along(data: Path, tmp_path: Path) ->
     o = ad.Array3f(dr.linspace(ad.Float, -0.75, 0.75, 16), 0.6, 4)
     d = ad.Array3f(0, 0, -1) + dr.zeros(ad.Array3f, 16)
     march = run.trainer.march_settings()
-    loaded = render_rays(field, o, d, march, occupancy=occupancy)
-    trained = render_rays(run.trainer.field, o, d, march, occupancy=run.trainer.occupancy)
-    assert loaded.queries == trained.queries < render_rays(field, o, d, march).queries
+    loaded = render_rays(MarchedField(field, march, occupancy), o, d)
+    trained = render_rays(MarchedField(run.trainer.field, march, run.trainer.occupancy), o, d)
+    assert loaded.queries == trained.queries < render_rays(MarchedField(field, march), o, d).queries
     np.testing.assert_array_equal(np.array(loaded.opacity), np.array(trained.opacity))
 
 
@@ -405,7 +409,9 @@ def test_the_loss_is_that_of_both_networks(views: Dataset) -> None:
     rng = step_rng(ad.Float, config.seed, 0)
     batch = trainer._source.draw(64, rng)
     jitter = rng.random(ad.Float, 64 * 12)
-    first = place_samples(field, batch.o, batch.d, trainer.march_settings(), jitter=jitter)
+    first = place_samples(
+        MarchedField(field, trainer.march_settings()), batch.o, batch.d, jitter=jitter
+    )
     seen = [integrate(Evaluation(coarse, first, 1024), first)]
     second = refine(first, seen[0].weights, 12, jitter=rng.random(ad.Float, 64 * 12))
     assert second.count == 24 and second.coarse_queries == first.queries
@@ -433,12 +439,7 @@ def test_sample_positions_are_detached(views: Dataset) -> None:
         for name, tensor in trainer.field.parameters().items():
             trainer.optimizer.assign(name, tensor * factor)
         runs.append(trainer)
-        trainer.optimizer.zero_grad()
-        rng = step_rng(ad.Float, config.seed, 0)
-        batch = trainer._source.draw(64, rng)
-        jitter = rng.random(ad.Float, 64 * 12)
-        fine_jitter = rng.random(ad.Float, 64 * config.sampling.fine)
-        trainer._differentiate(batch, (0, 64), 64, jitter, fine_jitter)
+        trainer._differentiate(trainer._draw())
     a, b = ({n: np.array(dr.grad(t)) for n, t in run.parameters.items()} for run in runs)
     for name, gradient in a.items():
         if name.startswith("coarse."):
@@ -453,16 +454,16 @@ def test_fine_samples_gather_at_the_surface(data: Path, tmp_path: Path) -> None:
     assert contents.march.samples == contents.march.fine == 12 and contents.coarse is not None
     field, _ = contents.build(ad)
     o, d = ad.Array3f([0, 0.1], [-4, -4], [0, 0.2]), ad.Array3f([0, 0], [1, 1], [0, 0])
-    samples = place_samples(field, o, d, contents.march)
+    samples = place_samples(MarchedField(field, contents.march), o, d)
     t = np.array(samples.t).reshape(2, 24)
     assert (np.diff(t, axis=1) >= 0).all()
-    uniform = place_samples(field, o, d, replace(contents.march, fine=0, samples=24))
+    uniform = place_samples(MarchedField(field, replace(contents.march, fine=0, samples=24)), o, d)
     surface = 4 - 0.8  # of the ball, about
     near = [np.mean(np.abs(np.array(s.t) - surface) < 0.3) for s in (samples, uniform)]
     assert near[0] > 1.2 * near[1]
-    seen = render_rays(field, o, d, contents.march)
+    seen = render_rays(MarchedField(field, contents.march), o, d)
     assert seen.queries == samples.queries + samples.coarse_queries
-    again = render_rays(field, o, d, contents.march)
+    again = render_rays(MarchedField(field, contents.march), o, d)
     assert (np.array(seen.color[0]) == np.array(again.color[0])).all()  # no chance involved
 
 

@@ -16,7 +16,7 @@ from .placement import PlacedField
 
 
 @dataclass(frozen=True)
-class Marched:
+class SampledField:
     """A field of the scene and how it is sampled."""
 
     placed: PlacedField
@@ -30,7 +30,7 @@ class Marched:
         """The field."""
         return self.placed.medium.field
 
-    def unbounded(self) -> Marched:
+    def unbounded(self) -> SampledField:
         """The same field for rays that do not come from a camera: near and far are its."""
         return replace(self, near=0.0, far=math.inf)
 
