@@ -67,6 +67,40 @@ def test_permissions_follow_the_umask(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
 
 
+def test_the_umask_is_never_touched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It belongs to the whole process: files of other threads would be open to all meanwhile."""
+    monkeypatch.setattr(os, "umask", lambda _: pytest.fail("the umask is changed"))
+    with replacing(tmp_path / "a") as temporary:
+        temporary.write_text("x")
+
+
+def test_a_writer_may_replace_the_temporary_file(tmp_path: Path) -> None:
+    with replacing(tmp_path / "a") as temporary:
+        mode = stat.S_IMODE(temporary.stat().st_mode)
+        (tmp_path / "b").touch(0o600)
+        (tmp_path / "b").replace(temporary)
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == mode
+
+
+def test_content_reaches_the_disk_before_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a power failure may leave an empty file under the final name."""
+    calls: list[str] = []
+    sync, rename = os.fsync, os.replace
+
+    def fsync(handle: int) -> None:
+        kind = "folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file"
+        calls.append(f"{kind} synced, {len(list(tmp_path.glob('a')))} named")
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", lambda *a: (calls.append("renamed"), rename(*a)))
+    with replacing(tmp_path / "a") as temporary:
+        temporary.write_text("x")
+    assert calls == ["file synced, 0 named", "renamed", "folder synced, 1 named"]
+
+
 def test_a_folder_is_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "a").mkdir()
     with pytest.raises(InputError, match="a: cannot be written"), replacing(tmp_path / "a") as t:
