@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from mi_nerf import FieldFile, NeuralFieldConfig, load_field, save_field
 from mi_nerf.base.errors import InputError
@@ -173,7 +174,7 @@ def test_tensors_come_back(tmp_path: Path) -> None:
     description = {"x": [1, {"y": None}], "ü": "ß"}
     path = tmp_path / "a.safetensors"
     write_tensors(path, arrays, kind="thing", version=3, description=description)
-    found, text = read_tensors(path, kind="thing", version=3)
+    found, text = read_tensors(path, kind="thing", newest=3)
     assert text == description
     assert found.keys() == arrays.keys()
     for name, array in arrays.items():
@@ -186,11 +187,18 @@ def test_tensors_of_another_kind_or_version(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     write_tensors(path, {}, kind="thing", version=3, description={})
     with pytest.raises(InputError, match=r"a.*: holds 'mi_nerf.thing', expected 'mi_nerf.field'"):
-        read_tensors(path, kind="field", version=3)
-    with pytest.raises(InputError, match=r"thing file of version 3, this mi_nerf reads version 4"):
-        read_tensors(path, kind="thing", version=4)
+        read_tensors(path, kind="field", newest=3)
+    for newest in (3, 4):
+        read_tensors(path, kind="thing", newest=newest, oldest=3)
+    with pytest.raises(InputError, match=r"newer than this program: .* version 3, .* up to 2; upd"):
+        read_tensors(path, kind="thing", newest=2)
+    with pytest.raises(InputError, match=r"thing file of format version 3, expected 4 or newer"):
+        read_tensors(path, kind="thing", newest=5, oldest=4)
     with pytest.raises(InputError, match=r"b.safetensors: not found, expected a .safetensors file"):
-        read_tensors(tmp_path / "b.safetensors", kind="thing", version=3)
+        read_tensors(tmp_path / "b.safetensors", kind="thing", newest=3)
+    save_file({}, path, {"format": "mi_nerf.thing", "version": "3.1"})
+    with pytest.raises(InputError, match=r"damaged thing file: its format version is '3.1'"):
+        read_tensors(path, kind="thing", newest=3)
 
 
 def test_tensors_cut_anywhere_are_refused(tmp_path: Path) -> None:
@@ -200,7 +208,7 @@ def test_tensors_cut_anywhere_are_refused(tmp_path: Path) -> None:
     for size in range(len(whole)):
         path.write_bytes(whole[:size])
         with pytest.raises(InputError, match="a.safetensors: not a complete safetensors file"):
-            read_tensors(path, kind="thing", version=1)
+            read_tensors(path, kind="thing", newest=1)
 
 
 # ---- Field files ----------------------------------------------------------------------
