@@ -3,8 +3,9 @@
     python -m tests.golden.make tests/golden/VERSION
 
 The folders beside this file were written so, each by the version whose name it bears (0.1.0
-with other import paths): all later versions must read them and find what that one found,
-see ``tests/formats/test_golden.py``. ``OUT`` is created and receives
+with other import paths; ``unreleased`` by the present state): all later versions must read
+them and find what that one found, see ``tests/formats/test_golden.py``. ``OUT`` is created
+and receives
 
 - ``fourier.safetensors``: a field of Fourier features with an occupancy grid, near and far
   limits, and early termination;

@@ -29,7 +29,7 @@ def test_a_run_whose_settings_are_not_known_any_more(
     change_settings(run, downscale=2, learning_rate=1e-3, sampling={"strata": 3})
     found = mi_nerf.evaluate(run, views=1)
     assert found["size"] == [12, 12]  # as it was trained
-    assert main(["render", str(run), "--view", "0", "-o", str(tmp_path / "a.png")]) == 0
+    assert main(["render", str(run), "-o", str(tmp_path / "views"), "--path", "test"]) == 0
     assert main(["info", str(run)]) == 0
     assert "20 steps" in capsys.readouterr().out
     with pytest.raises(InputError, match="not a training configuration of this version"):
