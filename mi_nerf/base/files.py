@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
+import stat
 import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,22 +25,34 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         InputError: if the folder cannot be written to.
     """
     target = Path(path)
+    temporary = target.parent / f".{target.stem}-{secrets.token_hex(8)}{target.suffix}"
     try:
-        handle, name = tempfile.mkstemp(
-            dir=target.parent, prefix=f".{target.stem}-", suffix=target.suffix
-        )
+        # The system applies the umask, which cannot be read without changing it for all threads.
+        handle = os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666)
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror}") from error
+    mode = stat.S_IMODE(os.fstat(handle).st_mode)
     os.close(handle)
-    temporary = Path(name)
     try:
         yield temporary
-        os.chmod(temporary, 0o666 & ~_umask())
+        os.chmod(temporary, mode)  # some writers put a file of their own there
+        _sync(temporary)
         os.replace(temporary, target)
+        with suppress(OSError):  # not every system can do that to a folder
+            _sync(target.parent)
     except OSError as error:
         raise InputError(f"{target}: cannot be written: {error.strerror}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    """Waits until a file or folder is on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def write_json(path: str | os.PathLike[str], data: Any) -> None:
@@ -112,9 +126,3 @@ def check_file(path: str | os.PathLike[str]) -> None:
     if file.is_dir():
         raise InputError(f"{file}: expected an output file, this is a folder")
     check_folder(file.parent)
-
-
-def _umask() -> int:
-    value = os.umask(0)
-    os.umask(value)
-    return value

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
-from pathlib import Path
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import drjit as dr
@@ -25,6 +26,37 @@ def cores() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on this system
         return os.cpu_count() or 1
+
+
+def available_memory(system: Path = Path("/")) -> int:
+    """Bytes that this process may use: the machine's, or the least limit of its cgroups.
+
+    Args:
+        system: the folder that holds ``proc`` and ``sys``.
+    """
+    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    for file in _memory_limits(system):
+        try:
+            limits.append(int(file.read_text()))
+        except (OSError, ValueError):  # no such file, or "max"
+            continue
+    return min(limits)
+
+
+def _memory_limits(system: Path) -> Iterator[Path]:
+    """Where the cgroups of this process and those around them may have their limits."""
+    try:
+        lines = (system / "proc/self/cgroup").read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        group = PurePosixPath(path.lstrip("/"))
+        for part in (group, *group.parents):
+            if not controllers:  # version 2
+                yield system / "sys/fs/cgroup" / part / "memory.max"
+            elif "memory" in controllers.split(","):
+                yield system / "sys/fs/cgroup/memory" / part / "memory.limit_in_bytes"
 
 
 def machine(variant: str) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from safetensors.numpy import save_file
 
 from .errors import InputError
 from .files import replacing
+from .schema import check_version
 
 Arrays = dict[str, "np.ndarray[Any, Any]"]
 
@@ -33,8 +34,10 @@ def write_tensors(
         save_file({n: np.asarray(a, order="C") for n, a in arrays.items()}, temporary, metadata)
 
 
-def read_tensors(path: str | Path, *, kind: str, version: int) -> tuple[Arrays, dict[str, Any]]:
-    """Reads what :func:`write_tensors` wrote.
+def read_tensors(
+    path: str | Path, *, kind: str, newest: int, oldest: int = 1
+) -> tuple[Arrays, dict[str, Any]]:
+    """Reads what :func:`write_tensors` wrote, in a version from ``oldest`` to ``newest``.
 
     Raises:
         InputError: if the file is missing, damaged, of another kind or version.
@@ -43,11 +46,9 @@ def read_tensors(path: str | Path, *, kind: str, version: int) -> tuple[Arrays, 
     found, wanted = metadata.get("format", "no format"), f"mi_nerf.{kind}"
     if found != wanted:
         raise InputError(f"{path}: holds '{found}', expected '{wanted}'")
-    if metadata.get("version") != str(version):
-        raise InputError(
-            f"{path}: {kind} file of version {metadata.get('version')}, "
-            f"this mi_nerf reads version {version}"
-        )
+    version = metadata.get("version", "missing")
+    found_version = int(version) if version.isdecimal() else version
+    check_version(path, f"{kind} file", found_version, newest, oldest)
     try:
         with safe_open(path, framework="numpy") as file:
             arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import InputError
+from ..base.schema import Key, Number, Record
 from ..base.tensor_file import Arrays, prefixed, read_tensors, write_tensors
 from ..cameras.ndc import Ndc
 from ..fields.fourier import FourierEncoding
@@ -20,7 +20,79 @@ from ..march.marched import MarchedField
 from ..march.occupancy import OccupancyGrid
 from ..march.settings import MarchSettings
 
-VERSION = 1
+NEWEST = 1  # version of the format; a key that is added has ``since`` the next one
+
+# What a file says. Files from before 0.1.0 may lack what has a meaning where it is absent.
+_ENCODING = Record(
+    FourierEncoding,
+    {"frequencies": Key(int), "convention": Key(str), "include_input": Key(bool)},
+)
+_GRID = Record(
+    HashGridConfig,
+    {
+        "levels": Key(int),
+        "features": Key(int),
+        "log2_entries": Key(int),
+        "coarsest": Key(int),
+        "finest": Key(int | None),
+    },
+)
+_NETWORK = Record(
+    NetworkConfig,
+    {
+        "depth": Key(int),
+        "width": Key(int),
+        "skip": Key(int),
+        "feature_layer": Key(bool),
+        "feature_relu": Key(bool, absent=False),
+        "view_depth": Key(int),
+        "view_width": Key(int),
+        "view_dependent": Key(bool),
+    },
+)
+_FIELD = Record(
+    NeuralFieldConfig,
+    {
+        "lower": Key(list),
+        "upper": Key(list),
+        "color_space": Key(str),
+        "position": Key(_ENCODING),
+        "grid": Key(_GRID, absent=None),
+        "direction": Key(_ENCODING),
+        "network": Key(_NETWORK),
+        "density_activation": Key(str),
+        "density_shift": Key(Number),
+        "density_scale": Key(Number),
+        "color_activation": Key(str),
+        "input_center": Key(list),
+        "input_scale": Key(Number),
+        "ndc": Key(
+            Record(Ndc, {"scale_x": Key(Number), "scale_y": Key(Number), "near": Key(Number)}),
+            absent=None,
+        ),
+    },
+)
+_MARCH = Record(
+    MarchSettings,
+    {
+        "samples": Key(int),
+        "fine": Key(int, absent=0),
+        "near": Key(Number | None),
+        "far": Key(Number | None),
+        "rule": Key(str, absent="constant"),
+        "stop": Key(Number, absent=0.0),
+    },
+)
+_DESCRIPTION = Record(
+    dict,
+    {
+        "field": Key(dict),  # a ``kind``, and the keys of _FIELD
+        "density_unit": Key(str),
+        "occupancy_shape": Key(list | None),
+        "march": Key(_MARCH),
+        "provenance": Key(dict),
+    },
+)
 
 
 @dataclass(frozen=True)
@@ -61,35 +133,37 @@ def save_field(path: str | Path, contents: FieldFile) -> None:
         arrays |= {f"coarse.{name}": array for name, array in contents.coarse.items()}
     if contents.occupancy is not None:
         arrays["occupancy"] = np.packbits(contents.occupancy)
-    names = ("samples", "fine", "near", "far", "rule", "stop")
-    march = {name: getattr(contents.march, name) for name in names}
     description = {
-        "field": {"kind": "neural", **dataclasses.asdict(contents.config)},
+        "field": {"kind": "neural", **_FIELD.write(contents.config)},
         "density_unit": "1/scene unit",
         "occupancy_shape": None if contents.occupancy is None else contents.occupancy.shape,
-        "march": march,
+        "march": _MARCH.write(contents.march),
         "provenance": contents.provenance,
     }
-    write_tensors(path, arrays, kind="field", version=VERSION, description=description)
+    version = max(_FIELD.version(contents.config), _MARCH.version(contents.march))
+    write_tensors(path, arrays, kind="field", version=version, description=description)
 
 
 def load_field(path: str | Path) -> FieldFile:
     """Reads a field file.
 
     Raises:
-        InputError: if it is missing, damaged, of another version, or its tensors do not
+        InputError: if it is missing, damaged, newer than this program, or its tensors do not
             fit its description.
     """
-    arrays, description = read_tensors(path, kind="field", version=VERSION)
+    arrays, text = read_tensors(path, kind="field", newest=NEWEST)
     try:
-        config = _field_config(description["field"])
-        weights, coarse = prefixed(arrays, "weights."), prefixed(arrays, "coarse.")
+        description = _DESCRIPTION.read(text)
         occupancy = None
         if description["occupancy_shape"] is not None:
-            occupancy = _unpack(arrays["occupancy"], tuple(description["occupancy_shape"]))
-        march = MarchSettings(**description["march"])
+            occupancy = _unpack(arrays["occupancy"], description["occupancy_shape"])
         contents = FieldFile(
-            config, weights, occupancy, march, description["provenance"], coarse or None
+            _field_config(description["field"]),
+            prefixed(arrays, "weights."),
+            occupancy,
+            description["march"],
+            description["provenance"],
+            prefixed(arrays, "coarse.") or None,
         )
     except KeyError as error:
         raise InputError(f"{path}: damaged field description: {error} is missing") from error
@@ -110,19 +184,12 @@ def _unpack(packed: np.ndarray[Any, Any], shape: tuple[int, ...]) -> np.ndarray[
 
 
 def _field_config(data: dict[str, Any]) -> NeuralFieldConfig:
-    values = dict(data)
-    if (kind := values.pop("kind")) not in ("neural", "fourier"):  # the first one's old name
+    kind = data.get("kind")
+    if kind not in ("neural", "fourier"):  # the first one's old name
         raise ValueError(f"field kind '{kind}', expected 'neural'")
-    for name in ("lower", "upper", "input_center"):
-        values[name] = tuple(values[name])
-    for name in ("position", "direction"):
-        values[name] = FourierEncoding(**values[name])
-    values["network"] = NetworkConfig(**values["network"])
-    if values.get("grid") is not None:  # files of Fourier fields may not mention it
-        values["grid"] = HashGridConfig(**values["grid"])
-    if values.get("ndc") is not None:  # files of fields in scene space may not mention it
-        values["ndc"] = Ndc(**values["ndc"])
-    return NeuralFieldConfig(**values)
+    rest = {name: value for name, value in data.items() if name != "kind"}
+    config: NeuralFieldConfig = _FIELD.read(rest, "field.")
+    return config
 
 
 def _check_weights(path: str | Path, config: NeuralFieldConfig, weights: Arrays) -> None:

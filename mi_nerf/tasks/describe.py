@@ -12,15 +12,15 @@ import drjit as dr
 from .._version import __version__
 from ..base.errors import InputError
 from ..base.files import read_json
-from ..base.tensor_file import read_metadata, read_tensors
+from ..base.tensor_file import read_metadata
 from ..base.variants import available_variants
 from ..data import available_splits, load_dataset
 from ..fields.hash_grid import HashGridConfig
 from ..formats.field_file import FieldFile, load_field
 from ..generation.run import RECORD, ceilings
-from ..training import checkpoint
 from ..training.auto import Decision
-from ..training.run_folder import CHECKPOINT, CONFIG, FIELD, read_config
+from ..training.checkpoint import read_checkpoint
+from ..training.run_folder import CHECKPOINT, CONFIG, FIELD, read_record
 
 
 def system() -> str:
@@ -62,17 +62,17 @@ def describe(path: Path) -> str:
 
 
 def _run(folder: Path) -> str:
-    config, record = read_config(folder)
-    data = record["data"]
+    record = read_record(folder)
+    settings, data = record["settings"], record["data"]
     rows: dict[str, str] = {
         "run": str(folder),
-        "preset": config.preset,
+        "preset": str(settings.get("preset", "unknown")),
         "data": f"{data['path']}, {data['views']} views of {data['size'][0]}x{data['size'][1]}",
         "variant": str(record.get("variant", "unknown")),
         "budget": ", ".join(
-            f"{v:g} {n}"
-            for n, v in (("steps", config.steps), ("seconds", config.max_seconds))
-            if v is not None
+            f"{settings[name]:g} {unit}"
+            for name, unit in (("steps", "steps"), ("max_seconds", "seconds"))
+            if isinstance(settings.get(name), int | float)
         ),
     }
     if (folder / CHECKPOINT).exists():
@@ -91,18 +91,13 @@ def _decisions(record: dict[str, Any]) -> list[str]:
 
 
 def _checkpoint_rows(path: Path) -> dict[str, str]:
-    _, description = read_tensors(path, kind="checkpoint", version=checkpoint.VERSION)
-    try:
-        return {
-            "checkpoint": str(path),
-            "step": str(description["step"]),
-            "seconds": f"{description['progress']['seconds']:.0f}",
-            "restarts": str(description["attempt"]),
-        }
-    except KeyError as error:
-        raise InputError(f"{path}: damaged checkpoint: {error} is missing") from error
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{path}: damaged checkpoint: {error}") from error
+    _, description = read_checkpoint(path)
+    return {
+        "checkpoint": str(path),
+        "step": str(description.step),
+        "seconds": f"{description.progress.seconds:.0f}",
+        "restarts": str(description.attempt),
+    }
 
 
 def _field_rows(path: Path, contents: FieldFile) -> dict[str, str]:

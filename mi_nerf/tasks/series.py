@@ -11,9 +11,9 @@ from typing import Any
 from ..base.errors import InputError
 from ..base.files import read_json, write_json
 from ..training import run as training
-from ..training.config import TrainConfig, from_json
+from ..training.config import TrainConfig
 from ..training.run import Run, TrainingError
-from ..training.run_folder import CONFIG
+from ..training.run_folder import CONFIG, read_config
 
 RESULT = "eval.json"
 
@@ -60,8 +60,7 @@ def trained(
         found: dict[str, Any] = read_json(folder / RESULT, "the evaluation of a run")
         return found
     if (folder / CONFIG).exists():
-        recorded = read_json(folder / CONFIG, "the config.json of a run")["settings"]
-        config = from_json(recorded, str(folder / CONFIG))
+        config, _ = read_config(folder)
     started = time.monotonic()
     run = training.start(data, folder, config, variant, resume=True, started=started, given=given)
     try:

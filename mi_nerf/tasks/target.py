@@ -9,7 +9,7 @@ from typing import Any
 
 from ..base.errors import InputError
 from ..formats.field_file import FieldFile, load_field
-from ..training.run_folder import CONFIG, FIELD, LOG, read_config
+from ..training.run_folder import CONFIG, FIELD, LOG, read_record
 
 
 @dataclass(frozen=True)
@@ -28,13 +28,19 @@ class Target:
 
     @property
     def train_seconds(self) -> float | None:
-        """Wall-clock seconds of training, from the last line of the run's log."""
-        if self.record is None or not (self.path / LOG).exists():
+        """Wall-clock seconds of training that the field has seen; ``None`` if nobody knows.
+
+        Fields of runs up to version 0.1.0 do not say: the last line of the run's log does,
+        which may be younger.
+        """
+        if self.record is None:
             return None
-        lines = (self.path / LOG).read_text().splitlines()
+        seconds = self.contents.provenance.get("seconds")
         try:
-            return float(json.loads(lines[-1])["seconds"]) if lines else None
-        except (ValueError, KeyError):
+            if seconds is None:
+                seconds = json.loads((self.path / LOG).read_text().splitlines()[-1])["seconds"]
+            return float(seconds)
+        except (OSError, IndexError, KeyError, TypeError, ValueError):
             return None
 
 
@@ -48,10 +54,15 @@ def open_target(path: str | Path) -> Target:
     if target.is_dir():
         if not (target / CONFIG).exists():
             raise InputError(f"{target}: no {CONFIG} in it, expected the folder of a run")
-        config, record = read_config(target)
+        record = read_record(target)
+        downscale = record["settings"].get("downscale", 1)  # nothing else need be known here
+        if not isinstance(downscale, int) or downscale < 1:
+            raise InputError(
+                f"{target / CONFIG}: downscale={downscale!r}, expected a whole number above 0"
+            )
         if not (target / FIELD).exists():
             raise InputError(f"{target}: no {FIELD} yet, expected a run with a checkpoint")
-        return Target(target, load_field(target / FIELD), record, config.downscale)
+        return Target(target, load_field(target / FIELD), record, downscale)
     if not target.exists():
         raise InputError(f"{target}: not found, expected a run folder or a field file")
     return Target(target, load_field(target), None)

@@ -20,12 +20,12 @@ step costs are measured, so that another machine, or a busier one, may decide ot
 from __future__ import annotations
 
 import math
-import os
 import time
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any
 
+from ..base.machine import available_memory
 from ..data import Dataset
 from . import probes
 from .config import TrainConfig, to_json, with_settings
@@ -162,7 +162,7 @@ def _settle_sampling(choice: _Settings, occupied: float) -> None:
             f"the grid has {grid.finest} vertices along the box, "
             f"{occupied:.0%} of which may hold something",
         )
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    memory = available_memory()
     sampling = choice.config.sampling
     batch = fitting_batch(sampling.batch, sampling.samples, memory)
     choice.take(

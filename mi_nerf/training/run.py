@@ -7,7 +7,7 @@ import platform
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -28,10 +28,10 @@ from ..march.marched import MarchedField
 from ..march.settings import MarchSettings
 from ..march.view import Image, View, display_image, render_view
 from .auto import Choice, Decision, choose
-from .checkpoint import load_checkpoint, save_checkpoint
+from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .config import TrainConfig, to_json
 from .progress import Meter, ProgressBar
-from .run_folder import CHECKPOINT, CONFIG, FIELD, LOG, cut_log, read_config
+from .run_folder import CHECKPOINT, CONFIG, FIELD, FORMAT, LOG, cut_log, read_config
 from .schedule import learning_rate
 from .trainer import StepResult, Trainer
 
@@ -94,16 +94,9 @@ class Run:
 
     def resume(self) -> None:
         """Goes back to the checkpoint of the folder, and cuts the log to match."""
-        state = load_checkpoint(self.folder / CHECKPOINT, self.trainer)
-        try:
-            self._before = float(state["seconds"])
-            self._skipped = int(state["skipped"])
-            self._attempt_start = int(state["attempt_start"])
-            self._begun = int(state.get("begun", 0))
-        except (KeyError, TypeError, ValueError) as error:
-            raise InputError(
-                f"{self.folder / CHECKPOINT}: damaged description of the progress: {error}"
-            ) from error
+        progress = load_checkpoint(self.folder / CHECKPOINT, self.trainer)
+        self._before, self._skipped = progress.seconds, progress.skipped
+        self._attempt_start, self._begun = progress.attempt_start, progress.begun
         cut_log(self.folder / LOG, self.trainer.step_count)
 
     def train(
@@ -118,7 +111,7 @@ class Run:
             TrainingError: after too many non-finite steps in a row, or collapses.
         """
         with ProgressBar(self.config, self.progress, show_bar) as bar:
-            for line in self.reports(after_step):
+            for line in self._reports(after_step, hold=True):
                 bar.update(self.progress, line, self.interrupted)
 
     def reports(
@@ -131,15 +124,21 @@ class Run:
         ``learning_rate``, ``occupied`` (share of the box), ``skipped`` steps: means since the
         last one, ``report_every`` seconds ago. What the caller does between two reports takes
         no training time. Ctrl-C, or *interrupt* in a notebook, ends training after the present
-        step; leaving the loop ends it, too. Either way the run is saved, and a further call
-        goes on.
+        step; what the caller does with a report, it interrupts as usual. Leaving the loop ends
+        training, too. In any case the run is saved, and a further call goes on.
 
         Raises:
             TrainingError: after too many non-finite steps in a row, or collapses.
         """
-        self._start_clock()
-        last_report = last_save = self.seconds
-        with (self.folder / LOG).open("a") as log, interruptible() as stop:
+        return self._reports(after_step, hold=False)
+
+    def _reports(
+        self, after_step: Callable[[Run], object] | None, hold: bool
+    ) -> Iterator[dict[str, Any]]:
+        """:meth:`reports`; with ``hold``, signals are requests between reports, too."""
+        log_file = (self.folder / LOG).open("a")
+        with self._clock_running(), log_file as log, interruptible() as stop:
+            last_report = last_save = self.seconds
             self._log, self.interrupted = log, False
             # At least one step, so that there is always a field to look at.
             while (self.progress < 1 or self.trainer.step_count == 0) and not stop:
@@ -153,7 +152,7 @@ class Run:
                     self._settle()
                     line, last_report = self._report(), now
                     try:
-                        with self.clock_stopped():
+                        with self.clock_stopped(), nullcontext() if hold else stop.released():
                             yield line
                     except GeneratorExit:  # the caller left the loop
                         break
@@ -165,7 +164,6 @@ class Run:
             self.interrupted = bool(stop)
             self._settle()
             self.save()
-        self.pause()
 
     def view(self, intrinsics: Intrinsics, cam_to_world: ArrayLike, spp: int = 1) -> View:
         """What a camera sees of the field as it is now; see :func:`mi_nerf.march.view.render_view`.
@@ -191,12 +189,7 @@ class Run:
 
     def save(self) -> None:
         """Writes the checkpoint and the field file."""
-        progress = {
-            "seconds": self.seconds,
-            "skipped": self._skipped,
-            "attempt_start": self._attempt_start,
-            "begun": self._begun,
-        }
+        progress = Progress(self.seconds, self._skipped, self._attempt_start, self._begun)
         save_checkpoint(self.folder / CHECKPOINT, self.trainer, progress)
         save_field(self.folder / FIELD, self.field_file())
 
@@ -208,7 +201,12 @@ class Run:
             trainer.field.weights(),
             trainer.occupancy.mask() if trainer.occupancy is not None else None,
             self._render_settings(),
-            {"mi_nerf": __version__, "preset": self.config.preset, "steps": trainer.step_count},
+            {
+                "mi_nerf": __version__,
+                "preset": self.config.preset,
+                "steps": trainer.step_count,  # that these weights have seen
+                "seconds": round(self.seconds, 3),
+            },
             None if trainer.field.coarse is None else trainer.field.coarse.weights(),
         )
 
@@ -235,6 +233,14 @@ class Run:
             yield
         finally:
             self._start_clock()
+
+    @contextmanager
+    def _clock_running(self) -> Iterator[None]:
+        self._start_clock()
+        try:
+            yield
+        finally:
+            self.pause()
 
     def pause(self) -> None:
         """Stops the clock until training goes on."""
@@ -400,6 +406,7 @@ def _record(run: Run, dataset: Dataset) -> dict[str, Any]:
 
     field, size = run.trainer.field_config, dataset.intrinsics
     return {
+        "format": FORMAT,
         "settings": to_json(run.config),
         "seed": run.config.seed,
         "data": {

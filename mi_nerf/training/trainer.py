@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..base.kernel_stages import stage
+from ..base.machine import available_memory
 from ..data import Dataset
 from ..fields.neural import NeuralField
 from ..fields.noise import DensityNoise
@@ -54,7 +54,7 @@ def _require_memory(config: TrainConfig) -> None:
     sampling = config.sampling
     samples = (sampling.rays or _FEWEST_RAYS) * (2 * sampling.samples + sampling.fine)
     needed = samples * _BYTES_PER_SAMPLE
-    there = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    there = available_memory()
     if needed > there:
         raise InputError(
             f"sampling.samples={sampling.samples}, fine={sampling.fine}: one step would need "

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from mi_nerf import FieldFile, NeuralFieldConfig, load_field, save_field
 from mi_nerf.base.errors import InputError
@@ -65,6 +66,40 @@ def test_permissions_follow_the_umask(tmp_path: Path) -> None:
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
+
+
+def test_the_umask_is_never_touched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It belongs to the whole process: files of other threads would be open to all meanwhile."""
+    monkeypatch.setattr(os, "umask", lambda _: pytest.fail("the umask is changed"))
+    with replacing(tmp_path / "a") as temporary:
+        temporary.write_text("x")
+
+
+def test_a_writer_may_replace_the_temporary_file(tmp_path: Path) -> None:
+    with replacing(tmp_path / "a") as temporary:
+        mode = stat.S_IMODE(temporary.stat().st_mode)
+        (tmp_path / "b").touch(0o600)
+        (tmp_path / "b").replace(temporary)
+    assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == mode
+
+
+def test_content_reaches_the_disk_before_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a power failure may leave an empty file under the final name."""
+    calls: list[str] = []
+    sync, rename = os.fsync, os.replace
+
+    def fsync(handle: int) -> None:
+        kind = "folder" if stat.S_ISDIR(os.fstat(handle).st_mode) else "file"
+        calls.append(f"{kind} synced, {len(list(tmp_path.glob('a')))} named")
+        sync(handle)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", lambda *a: (calls.append("renamed"), rename(*a)))
+    with replacing(tmp_path / "a") as temporary:
+        temporary.write_text("x")
+    assert calls == ["file synced, 0 named", "renamed", "folder synced, 1 named"]
 
 
 def test_a_folder_is_not_replaced(tmp_path: Path) -> None:
@@ -139,7 +174,7 @@ def test_tensors_come_back(tmp_path: Path) -> None:
     description = {"x": [1, {"y": None}], "ü": "ß"}
     path = tmp_path / "a.safetensors"
     write_tensors(path, arrays, kind="thing", version=3, description=description)
-    found, text = read_tensors(path, kind="thing", version=3)
+    found, text = read_tensors(path, kind="thing", newest=3)
     assert text == description
     assert found.keys() == arrays.keys()
     for name, array in arrays.items():
@@ -152,11 +187,18 @@ def test_tensors_of_another_kind_or_version(tmp_path: Path) -> None:
     path = tmp_path / "a.safetensors"
     write_tensors(path, {}, kind="thing", version=3, description={})
     with pytest.raises(InputError, match=r"a.*: holds 'mi_nerf.thing', expected 'mi_nerf.field'"):
-        read_tensors(path, kind="field", version=3)
-    with pytest.raises(InputError, match=r"thing file of version 3, this mi_nerf reads version 4"):
-        read_tensors(path, kind="thing", version=4)
+        read_tensors(path, kind="field", newest=3)
+    for newest in (3, 4):
+        read_tensors(path, kind="thing", newest=newest, oldest=3)
+    with pytest.raises(InputError, match=r"newer than this program: .* version 3, .* up to 2; upd"):
+        read_tensors(path, kind="thing", newest=2)
+    with pytest.raises(InputError, match=r"thing file of format version 3, expected 4 or newer"):
+        read_tensors(path, kind="thing", newest=5, oldest=4)
     with pytest.raises(InputError, match=r"b.safetensors: not found, expected a .safetensors file"):
-        read_tensors(tmp_path / "b.safetensors", kind="thing", version=3)
+        read_tensors(tmp_path / "b.safetensors", kind="thing", newest=3)
+    save_file({}, path, {"format": "mi_nerf.thing", "version": "3.1"})
+    with pytest.raises(InputError, match=r"damaged thing file: its format version is '3.1'"):
+        read_tensors(path, kind="thing", newest=3)
 
 
 def test_tensors_cut_anywhere_are_refused(tmp_path: Path) -> None:
@@ -166,7 +208,7 @@ def test_tensors_cut_anywhere_are_refused(tmp_path: Path) -> None:
     for size in range(len(whole)):
         path.write_bytes(whole[:size])
         with pytest.raises(InputError, match="a.safetensors: not a complete safetensors file"):
-            read_tensors(path, kind="thing", version=1)
+            read_tensors(path, kind="thing", newest=1)
 
 
 # ---- Field files ----------------------------------------------------------------------

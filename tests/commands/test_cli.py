@@ -425,6 +425,14 @@ RUN_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda r: change_json(r / "config.json", lambda c: c["settings"].update(qqq=1)),
         "config.json: not a training configuration of this version: unknown setting 'qqq'",
     ),
+    "newer settings": (
+        lambda r: change_json(r / "config.json", lambda c: c["format"].update(version=2)),
+        "config.json: newer than this program: config.json of format version 2, this mi_nerf",
+    ),
+    "other seed": (
+        lambda r: change_json(r / "config.json", lambda c: c["settings"].update(seed=1)),
+        "does not fit this run: it was trained with seed=0, expected 1 as in the run",
+    ),
     "text for a number": (
         lambda r: change_json(r / "config.json", lambda c: c["settings"].update(seed="1")),
         "seed='1', expected a whole number",
@@ -437,7 +445,7 @@ RUN_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda r: change_json(
             r / "config.json", lambda c: c["settings"]["network"].update(width=24)
         ),
-        "does not fit this run: tensor 'trunk_0.weight' is (16, 33), expected (24, 33)",
+        "does not fit this run: it was trained with network.width=16, expected 24",
     ),
     "cut in the header": (
         lambda r: cut(r / "checkpoint.safetensors", 1000),
@@ -453,7 +461,7 @@ RUN_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "other version": (
         lambda r: change_tensors(r / "checkpoint.safetensors", lambda m, _: m.update(version="99")),
-        "checkpoint file of version 99, this mi_nerf reads version 2",
+        "newer than this program: checkpoint file of format version 99, this mi_nerf reads up to 3",
     ),
     "other kind": (
         lambda r: shutil.copy(r / "field.safetensors", r / "checkpoint.safetensors"),
@@ -461,11 +469,11 @@ RUN_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "no step": (
         lambda r: change_description(r / "checkpoint.safetensors", lambda d: d.pop("step")),
-        "checkpoint.safetensors: does not fit this run: 'step' is missing",
+        "checkpoint.safetensors: damaged checkpoint: 'step' is missing",
     ),
     "no progress": (
         lambda r: change_description(r / "checkpoint.safetensors", lambda d: d.update(progress={})),
-        "checkpoint.safetensors: damaged description of the progress",
+        "checkpoint.safetensors: damaged checkpoint: 'progress.seconds' is missing",
     ),
     "moments of another shape": (
         lambda r: change_tensors(
@@ -492,7 +500,7 @@ FIELD_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "no safetensors": (lambda f: f.write_bytes(b"PK" * 99), "not a complete safetensors file"),
     "other version": (
         lambda f: change_tensors(f, lambda m, _: m.update(version="99")),
-        "field file of version 99, this mi_nerf reads version 1",
+        "newer than this program: field file of format version 99, this mi_nerf reads up to 1",
     ),
     "no description": (
         lambda f: change_tensors(f, lambda m, _: m.pop("description")),
@@ -509,6 +517,14 @@ FIELD_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
     "unknown field": (
         lambda f: change_description(f, lambda d: d["field"].update(kind="hash")),
         "field kind 'hash', expected 'neural'",
+    ),
+    "unknown key": (
+        lambda f: change_description(f, lambda d: d["field"]["network"].update(qqq=1)),
+        "damaged field description: unknown key 'field.network.qqq'",
+    ),
+    "text for a number": (
+        lambda f: change_description(f, lambda d: d["field"]["network"].update(depth="1")),
+        "damaged field description: 'field.network.depth' is '1', expected int",
     ),
     "box upside down": (
         lambda f: change_description(f, lambda d: d["field"].update(lower=[9, 9, 9])),

@@ -19,7 +19,7 @@ from mi_nerf.fields.hash_grid import HashGridConfig
 from mi_nerf.fields.network import NetworkConfig
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
 from mi_nerf.training import loss_scale
-from mi_nerf.training.checkpoint import load_checkpoint, save_checkpoint
+from mi_nerf.training.checkpoint import Progress, load_checkpoint, save_checkpoint
 from mi_nerf.training.config import TrainConfig, with_settings
 from mi_nerf.training.loss_scale import LossScale
 from mi_nerf.training.presets import preset
@@ -162,16 +162,18 @@ def test_it_goes_on_from_a_checkpoint(ad: Any, views: Dataset, tmp_path: Path) -
     trainer = Trainer(small(), views, ad)
     assert trainer.loss_scale is not None
     trainer.loss_scale.restore(np.array([2.0**9, 7], np.float32))
-    save_checkpoint(tmp_path / "c", trainer, {})
+    save_checkpoint(tmp_path / "c", trainer, Progress(0.0))
     other = Trainer(small(), views, ad)
     load_checkpoint(tmp_path / "c", other)
     assert other.loss_scale is not None
     np.testing.assert_array_equal(other.loss_scale.state(), [2.0**9, 7])
 
 
-def test_a_checkpoint_without_the_scale_is_refused(ad: Any, views: Dataset, tmp_path: Path) -> None:
-    save_checkpoint(tmp_path / "c", Trainer(small("half_precision=false"), views, ad), {})
-    with pytest.raises(InputError, match="loss_scale"):
+def test_a_checkpoint_of_full_precision_is_refused(ad: Any, views: Dataset, tmp_path: Path) -> None:
+    save_checkpoint(
+        tmp_path / "c", Trainer(small("half_precision=false"), views, ad), Progress(0.0)
+    )
+    with pytest.raises(InputError, match="half_precision=false, expected true"):
         load_checkpoint(tmp_path / "c", Trainer(small(), views, ad))
 
 

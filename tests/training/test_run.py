@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from mi_nerf.base.errors import InputError
+from mi_nerf.base.tensor_file import read_tensors, write_tensors
 from mi_nerf.cameras.pinhole import project
 from mi_nerf.data import Dataset, load_dataset
 from mi_nerf.fields.neural import NeuralFieldConfig
@@ -29,11 +30,13 @@ from mi_nerf.march.query import Evaluation
 from mi_nerf.march.render import render_rays
 from mi_nerf.training import run as training
 from mi_nerf.training.batches import step_rng
-from mi_nerf.training.config import OptimizerConfig, TrainConfig, with_settings
+from mi_nerf.training.config import OptimizerConfig, TrainConfig, from_json, to_json, with_settings
 from mi_nerf.training.model import resolved_octaves
+from mi_nerf.training.plain import leaves
 from mi_nerf.training.presets import preset
+from mi_nerf.training.progress import ProgressBar
 from mi_nerf.training.run import TrainingError
-from mi_nerf.training.run_folder import read_config
+from mi_nerf.training.run_folder import FORMAT, cut_log, read_config
 from mi_nerf.training.schedule import learning_rate
 from mi_nerf.training.trainer import Trainer
 from tests.support.datasets import write_blob_dataset
@@ -133,6 +136,7 @@ from mi_nerf.data import load_dataset
 from mi_nerf.training.trainer import Trainer
 from mi_nerf.training.config import with_settings
 from mi_nerf.training.presets import preset
+from mi_nerf.training.progress import ProgressBar
 config = with_settings(preset({name!r}), {settings!r})
 trainer = Trainer(config, load_dataset({str(data)!r}, "train"), ad)
 for _ in range(60):
@@ -295,6 +299,118 @@ def test_the_log_is_cut_back_to_the_checkpoint(data: Path, tmp_path: Path) -> No
     assert log.read_text() == kept
     run.train(show_bar=False)
     assert json.loads(log.read_text().splitlines()[-1])["step"] == 8
+
+
+def test_the_log_is_replaced_and_not_written_over(tmp_path: Path) -> None:
+    """Killed on the way, it leaves the old one whole: so a reader still sees all of it."""
+    log = tmp_path / "log.jsonl"
+    before = '{"step": 1}\n{"step": 2}\n'
+    log.write_text(before)
+    with log.open() as reader:
+        cut_log(log, 1)
+        assert reader.read() == before
+    assert log.read_text() == '{"step": 1}\n'
+
+
+@pytest.mark.parametrize("key", ["lr", "lr_final", "beta1"])
+def test_an_edited_config_does_not_resume(data: Path, tmp_path: Path, key: str) -> None:
+    training.start(data, tmp_path / "run", small(steps=3), "llvm_ad_rgb").train(show_bar=False)
+    path = tmp_path / "run/config.json"
+    record = json.loads(path.read_text())
+    record["settings"]["optimizer"][key] = 0.125
+    path.write_text(json.dumps(record))
+    said = f"does not fit this run: it was trained with optimizer.{key}=.*, expected 0.125 as in"
+    with pytest.raises(InputError, match=said):
+        training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb", resume=True)
+
+
+def test_what_changes_no_step_may_be_edited(data: Path, tmp_path: Path) -> None:
+    training.start(data, tmp_path / "run", small(steps=3), "llvm_ad_rgb").train(show_bar=False)
+    path = tmp_path / "run/config.json"
+    record = json.loads(path.read_text())
+    record["settings"] |= {"report_every": 7, "checkpoint_every": 9, "store_activations": 1}
+    record["settings"]["sampling"] |= {"render_samples": 17, "render_stop": 0.5}
+    path.write_text(json.dumps(record))
+    run = training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb", resume=True)
+    run.train(show_bar=False)
+    assert run.trainer.step_count == 5
+    assert load_field(tmp_path / "run/field.safetensors").march.samples == 17
+
+
+@pytest.mark.parametrize("edited", ["config.json", "nothing"])
+def test_a_checkpoint_of_version_2_knows_the_seed_alone(
+    data: Path, tmp_path: Path, edited: str
+) -> None:
+    training.start(data, tmp_path / "run", small(steps=3), "llvm_ad_rgb").train(show_bar=False)
+    path = tmp_path / "run/checkpoint.safetensors"
+    arrays, text = read_tensors(path, kind="checkpoint", newest=3)
+    text.pop("settings")
+    write_tensors(path, arrays, kind="checkpoint", version=2, description=text)
+    config = tmp_path / "run/config.json"
+    if edited == "config.json":
+        config.write_text(config.read_text().replace('"seed": 0', '"seed": 1'))
+        with pytest.raises(InputError, match="trained with seed=0, expected 1"):
+            training.start(data, tmp_path / "run", small(), "llvm_ad_rgb", resume=True)
+    else:
+        run = training.start(data, tmp_path / "run", small(), "llvm_ad_rgb", resume=True)
+        assert run.trainer.step_count == 3
+
+
+def test_settings_are_those_of_the_newest_golden_run() -> None:
+    """A setting that is added needs the next version of config.json, and golden files of it."""
+    golden = Path(__file__).parents[1] / "golden"
+    records = [json.loads(path.read_text()) for path in golden.glob("*/run/config.json")]
+    newest = [r for r in records if r.get("format", FORMAT) == FORMAT]
+    assert newest
+    for record in newest:
+        settings = from_json(record["settings"], "golden")
+        found = {name for name, _ in leaves(record["settings"])}
+        assert found == {name for name, _ in leaves(to_json(settings))}
+
+
+def test_signals_are_the_callers_between_two_reports(data: Path, tmp_path: Path) -> None:
+    usual = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    config = small(steps=3, report_every=0.0)
+    run = training.start(data, tmp_path / "run", config, "llvm_ad_rgb")
+    inside = []
+
+    def look(_: object) -> None:
+        inside.append(signal.getsignal(signal.SIGINT))
+
+    reports = run.reports(look)
+    for _ in range(2):
+        next(reports)
+        assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == usual
+    assert len(inside) == 1 and inside[0] != usual[0]  # in training they are requests
+    reports.close()
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == usual
+
+
+def test_a_signal_while_the_bar_is_drawn_is_a_request(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def update(*_: object) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(ProgressBar, "update", update)
+    config = small(steps=9, report_every=0.0)
+    run = training.start(data, tmp_path / "run", config, "llvm_ad_rgb")
+    run.train(show_bar=False)
+    assert run.interrupted and run.trainer.step_count == 1
+    assert (tmp_path / "run/checkpoint.safetensors").exists()
+
+
+def test_the_clock_stands_still_after_an_error(data: Path, tmp_path: Path) -> None:
+    run = training.start(data, tmp_path / "run", small(steps=5), "llvm_ad_rgb")
+
+    def fail(_: object) -> None:
+        raise RuntimeError("by the caller")
+
+    with pytest.raises(RuntimeError, match="by the caller"):
+        run.train(show_bar=False, after_step=fail)
+    stopped = run.seconds
+    time.sleep(0.01)
+    assert run.seconds == stopped
 
 
 def test_ctrl_c_saves_and_the_run_goes_on(data: Path, tmp_path: Path) -> None:
