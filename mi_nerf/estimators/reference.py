@@ -189,8 +189,7 @@ class _March:
         self._float = type(o[0])
         self._occupancy = occupancy
         self._block = block
-        fused = getattr(field, "fused", None)
-        self._ask: Ask = (None if fused is None else fused()) or field.density_emission
+        self._ask: Ask = field.fused() or field.density_emission
         double = dr.float64_array_t(self._float)
         vector3 = vector3_type(double)
         limits = tuple(b if b is None or isinstance(b, int | float) else double(b) for b in bounds)

@@ -178,8 +178,7 @@ class _Asker:
     """Density and emission where rays collide, in blocks that compile once."""
 
     def __init__(self, field: Field, block: int) -> None:
-        fused = getattr(field, "fused", None)
-        self._fused = None if fused is None else fused()
+        self._fused = field.fused()
         self._ask = self._fused or field.density_emission
         self._block = block
 

@@ -12,9 +12,7 @@ from .importance import inverse_transform, merge_sorted
 from .intervals import ray_segments
 from .occupancy import OccupancyGrid
 from .quadrature import sample_weights
-from .query import (
-    Evaluation,
-)
+from .query import Evaluation
 from .samples import Samples
 from .settings import MarchSettings
 from .strata import cell_widths, points_along, stratified
@@ -48,10 +46,9 @@ def place_samples(
             o, d, within.view, t, delta, count, near, far, ndc=ndc, rule=rule, even=even
         )
         samples = _select(samples, within.hit, occupancy, settings.hidden)
-        coarse = getattr(field, "coarse", None)
-        if coarse is None or not settings.fine:
+        if field.coarse is None or not settings.fine:
             return samples
-        evaluation = Evaluation(coarse, samples, settings.block, stop=settings.stop)
+        evaluation = Evaluation(field.coarse, samples, settings.block, stop=settings.stop)
         weights, _ = sample_weights(evaluation.density, delta, settings.samples)
         shift = jitter if jitter is not None and len(jitter) == samples.rays else None
         samples.index = evaluation.asked

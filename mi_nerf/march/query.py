@@ -59,8 +59,7 @@ class Evaluation:
         self._field, self._samples, self._block = field, samples, block
         self._graph: list[tuple[Any, Any, list[Any]]] = []
         self._tail = tail or (block // 4 if stop > 0 and block >= 4096 else block)
-        fused = getattr(field, "fused", None)
-        self._fused = fused(emission) if fused is not None and not keep else None
+        self._fused = None if keep else field.fused(emission)
         self._emits = emission
         float_type = type(samples.t)
         self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4 if emission else 1)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,7 +17,6 @@ from ..base.kernel_stages import stage
 from ..data import Dataset, hull
 from ..fields.fourier import FourierEncoding
 from ..fields.neural import NeuralField, NeuralFieldConfig
-from ..fields.noise import DensityNoise
 from ..fields.protocol import Field
 from ..march.occupancy import OccupancyGrid
 from ..march.placing import place_samples, refine
@@ -170,13 +168,13 @@ class Trainer:
         """Fresh weights, moments and occupancy, from the seed and the attempt."""
         config = self.config
         seed = config.seed + 1000 * self.attempt
-        self.field = NeuralField.create(self.field_config, seed, self._backend.TensorXf)
-        groups = {"": self.field.parameters()}
+        tensors, coarse = self._backend.TensorXf, None
         if config.sampling.fine:
-            self.field.coarse = NeuralField.create(
-                self.field_config, seed + _COARSE_SEED, self._backend.TensorXf
-            )
-            groups["coarse."] = self.field.coarse.parameters()
+            coarse = NeuralField.create(self.field_config, seed + _COARSE_SEED, tensors)
+        self.field = NeuralField.create(self.field_config, seed, tensors, coarse)
+        groups = {"": self.field.parameters()}
+        if coarse is not None:
+            groups["coarse."] = coarse.parameters()
         self.parameters = JointParameters(groups)
         options = config.optimizer
         self.optimizer = Adam(
@@ -222,11 +220,11 @@ class Trainer:
             fine_jitter = rng.random(float_type, rays * fine) if fine else float_type()
             dr.eval(jitter, fine_jitter)
         self.optimizer.zero_grad()
-        with self._networks_in_training():
-            parts = [
-                self._differentiate(batch.part(*part), part, rays, jitter, fine_jitter)
-                for part in self._parts(rays)
-            ]
+        field = self._field_in_training()
+        parts = [
+            self._differentiate(field, batch.part(*part), part, rays, jitter, fine_jitter)
+            for part in self._parts(rays)
+        ]
         loss, mse, counted = (sum(v[1:], v[0]) for v in list(zip(*parts, strict=True))[:3])
         with stage("optimizer"):
             accepted = self.optimizer.step(learning_rate, dr.isfinite(loss))
@@ -262,27 +260,24 @@ class Trainer:
         for start in range(0, rays, size):
             yield start, min(size, rays - start)
 
-    @contextmanager
-    def _networks_in_training(self) -> Iterator[None]:
+    def _field_in_training(self) -> NeuralField:
         """Noise on the densities of real captures (NeRF, appendix A), and half precision."""
-        networks = [f for f in (self.field, self.field.coarse) if f is not None]
-        for k, network in enumerate(networks):
-            if self.loss_scale is not None:
-                network.loss_scale = self.loss_scale.value
-            if self._noise_level > 0:
-                network.noise = DensityNoise(self._noise_level, 2 * self.step_count + k)
-        try:
-            yield
-        finally:
-            for network in networks:
-                network.noise = network.loss_scale = None
+        scale = None if self.loss_scale is None else self.loss_scale.value
+        return self.field.for_training(self._noise_level, 2 * self.step_count, scale)
 
     def _differentiate(
-        self, batch: RayBatch, part: tuple[int, int], rays: int, jitter: Any, fine_jitter: Any
+        self,
+        field: NeuralField,
+        batch: RayBatch,
+        part: tuple[int, int],
+        rays: int,
+        jitter: Any,
+        fine_jitter: Any,
     ) -> tuple[Any, Any, Any, int, int]:
         """Gradients of the loss over some of the step's rays are added to the parameters'.
 
         Args:
+            field: with noise and in half precision if need be.
             batch: the rays of this part.
             part: number of the first one, and how many.
             rays: those of the whole step.
@@ -297,7 +292,7 @@ class Trainer:
         march = self.march_settings()
         with stage("samples"):
             samples = place_samples(
-                self.field,
+                field,
                 batch.o,
                 batch.d,
                 march,
@@ -307,8 +302,8 @@ class Trainer:
         wanted = samples.queries
         complete = samples.truncate(budget)
         queries, passes = samples.queries, []
-        if self.field.coarse is not None:
-            coarse = self._evaluate(self.field.coarse, samples)
+        if field.coarse is not None:
+            coarse = self._evaluate(field.coarse, samples)
             with stage("compositing"):
                 passes.append((coarse, integrate(coarse, samples)))
             offsets = _rows(fine_jitter, part, sampling.fine)
@@ -318,7 +313,7 @@ class Trainer:
             wanted += samples.queries
             complete = dr.minimum(complete, samples.truncate(max(1, budget - queries)))
             queries += samples.queries
-        evaluation = self._evaluate(self.field, samples)
+        evaluation = self._evaluate(field, samples)
         with stage("compositing"):
             passes.append((evaluation, integrate(evaluation, samples)))
             errors = [self._errors(batch, seen, complete, share) for _, seen in passes]

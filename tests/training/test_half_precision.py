@@ -50,7 +50,8 @@ def gradients(
     field = NeuralField.create(config, 3, ad.TensorXf)
     weights = {n: w + rng.normal(0, 0.2, w.shape) for n, w in field.weights().items()}
     field = NeuralField(config, {n: w.astype(np.float32) for n, w in weights.items()}, ad.TensorXf)
-    field.loss_scale = None if scale is None else dr.opaque(ad.Float, scale)
+    if scale is not None:
+        field = field.for_training(loss_scale=dr.opaque(ad.Float, scale))
     p, d = (vectors(ad, v) for v in (rng.uniform(-1, 1, (200, 3)), unit(rng.normal(size=(200, 3)))))
     dr.enable_grad(field.parameters())
     dr.enable_grad(p)

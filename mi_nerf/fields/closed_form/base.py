@@ -16,7 +16,7 @@ import numpy as np
 from ...base.arrays import upload, vector3_type
 from ...base.box import Corner
 from ...base.color import ColorSpace
-from ...cameras.ndc import Ndc
+from ..protocol import Field
 
 
 def number(
@@ -80,14 +80,13 @@ def _is_number(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
 
 
-class ClosedFormField(ABC):
-    """A formula behind the Field protocol; every number of it is differentiable.
+class ClosedFormField(Field):
+    """A formula as a field; every number of it is differentiable.
 
     The box is no parameter: it stays as it was when numbers change.
     """
 
     color_space: ColorSpace = "linear"
-    ndc: Ndc | None = None
 
     def __init__(self, config: Any, tensor_type: Any) -> None:
         """Uploads the numbers of ``config`` as ``tensor_type`` (such as ``mi.TensorXf``)."""

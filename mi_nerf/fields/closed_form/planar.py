@@ -83,7 +83,7 @@ class SlabConfig(_BoxConfig):
 
 
 class SlabField(ClosedFormField):
-    """:class:`SlabConfig` behind the Field protocol."""
+    """:class:`SlabConfig` as a field."""
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
@@ -104,7 +104,7 @@ class TwoColorConfig(_AxisConfig):
 
 
 class TwoColorField(SlabField):
-    """:class:`TwoColorConfig` behind the Field protocol."""
+    """:class:`TwoColorConfig` as a field."""
 
     def emission(self, d: Any) -> Any:
         """The radiance along N directions, as a 3-vector of linear RGB."""
@@ -129,7 +129,7 @@ class FogConfig(_PlanarConfig):
 
 
 class FogField(_PlanarField):
-    """:class:`FogConfig` behind the Field protocol; its density ends at density · exp(60)."""
+    """:class:`FogConfig` as a field; its density ends at density · exp(60)."""
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
@@ -150,7 +150,7 @@ class RampConfig(_PlanarConfig):
 
 
 class RampField(_PlanarField):
-    """:class:`RampConfig` behind the Field protocol."""
+    """:class:`RampConfig` as a field."""
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
@@ -174,7 +174,7 @@ class StepConfig(_PlanarConfig):
 
 
 class StepField(_PlanarField):
-    """:class:`StepConfig` behind the Field protocol."""
+    """:class:`StepConfig` as a field."""
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
@@ -208,7 +208,7 @@ class SheetConfig(_PlanarConfig):
 
 
 class SheetField(_PlanarField):
-    """:class:`SheetConfig` behind the Field protocol."""
+    """:class:`SheetConfig` as a field."""
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""

@@ -37,7 +37,7 @@ class GaussianConfig(ClosedFormConfig):
 
 
 class GaussianField(ClosedFormField):
-    """:class:`GaussianConfig` behind the Field protocol."""
+    """:class:`GaussianConfig` as a field."""
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
@@ -77,7 +77,7 @@ class ShellConfig(ClosedFormConfig):
 
 
 class ShellField(ClosedFormField):
-    """:class:`ShellConfig` behind the Field protocol."""
+    """:class:`ShellConfig` as a field."""
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
