@@ -15,16 +15,16 @@ from typing import Any
 import drjit as dr
 from drjit import nn
 
-from .network import GRID, NetworkConfig
+from .network import GRID, Layer, NetworkConfig, evaluate
 
 WIDEST = 64  # neurons of a layer up to which this wins
 
 
 def worth_fusing(config: NetworkConfig, float_type: Any) -> bool:
     """Whether a network is narrow enough, and the backend one on which this was measured."""
-    widths = [config.width] + [config.view_width] * (config.view_depth > 0)
+    widest = max(layer.outputs for layer in config.layers())
     single = dr.type_v(float_type) == dr.VarType.Float32
-    return max(widths) <= WIDEST and single and dr.backend_v(float_type) == dr.JitBackend.LLVM
+    return widest <= WIDEST and single and dr.backend_v(float_type) == dr.JitBackend.LLVM
 
 
 class FusedNetwork:
@@ -45,34 +45,26 @@ class FusedNetwork:
         Args:
             position, direction: features, one array of N values each.
         """
-        config, h = self._config, self._trunk(position)
-        v = None if direction is None else nn.CoopVec(*direction)
-        density = self._layer("density", h, {})
-        if config.feature_layer:
-            h = self._layer("feature", h, {}, rectify=config.feature_relu)
-        seen = {} if v is None else {"direction_weight": v}
-        for i in range(config.view_depth):
-            h = self._layer(f"view_{i}", h, seen if i == 0 else {}, rectify=True)
-        color = self._layer("color", h, seen if config.view_depth == 0 else {})
+        h = self._trunk(position)
+        seen = None if direction is None else nn.CoopVec(*direction)
+        density = self._apply(self._config.density(), h, None)
+        color = evaluate(self._config.color(), self._apply, h, direction=seen)
         return next(iter(density)), list(color)
 
     def density(self, position: list[Any]) -> Any:
         """Raw density of N queries alone."""
-        return next(iter(self._layer("density", self._trunk(position), {})))
+        return next(iter(self._apply(self._config.density(), self._trunk(position), None)))
 
     def _trunk(self, position: list[Any]) -> Any:
-        x = h = nn.CoopVec(*position)
-        for i in range(self._config.depth):
-            extra = {"position_weight": x} if i == self._config.skip else {}
-            h = self._layer(f"trunk_{i}", h, extra, rectify=True)
-        return h
+        x = nn.CoopVec(*position)
+        return evaluate(self._config.trunk(), self._apply, x, position=x)
 
-    def _layer(self, name: str, x: Any, extra: dict[str, Any], *, rectify: bool = False) -> Any:
+    def _apply(self, layer: Layer, x: Any, seen: Any) -> Any:
         views = self._views
-        y = nn.matvec(views[f"{name}.weight"], x, views[f"{name}.bias"])
-        for kind, value in extra.items():
-            y = y + nn.matvec(views[f"{name}.{kind}"], value)
-        return dr.maximum(y, 0) if rectify else y
+        y = nn.matvec(views[layer.weight], x, views[layer.bias])
+        if layer.sees:
+            y = y + nn.matvec(views[layer.second_weight], seen)
+        return dr.maximum(y, 0) if layer.rectify else y
 
 
 class _ScaleGradient(dr.CustomOp):

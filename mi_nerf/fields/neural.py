@@ -167,7 +167,8 @@ class NeuralField(Field):
 
     def density(self, p: Any) -> Any:
         """σ at N points, in 1/scene unit."""
-        return self._density(network.density_head(self._weights, self._trunk(p)), p)
+        raw = network.density_head(self.config.network, self._weights, self._trunk(p))
+        return self._density(raw, p)
 
     def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
         """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
@@ -178,7 +179,8 @@ class NeuralField(Field):
         with stage("encoding"):
             direction = settled(config.direction(d)) if config.network.view_dependent else None
         raw = network.color_head(config.network, self._weights, h, direction)
-        return self._density(network.density_head(self._weights, h), p), self._color(raw)
+        density = network.density_head(config.network, self._weights, h)
+        return self._density(density, p), self._color(raw)
 
     def fused(self, emission: bool = True) -> Callable[..., Any] | None:
         """See :meth:`Field.fused`; ``None`` where that would be slower."""

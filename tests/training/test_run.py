@@ -438,7 +438,7 @@ def test_sample_positions_are_detached(views: Dataset) -> None:
         batch = trainer._source.draw(64, rng)
         jitter = rng.random(ad.Float, 64 * 12)
         fine_jitter = rng.random(ad.Float, 64 * config.sampling.fine)
-        trainer._differentiate(batch, (0, 64), 64, jitter, fine_jitter)
+        trainer._differentiate(trainer.field, batch, (0, 64), 64, jitter, fine_jitter)
     a, b = ({n: np.array(dr.grad(t)) for n, t in run.parameters.items()} for run in runs)
     for name, gradient in a.items():
         if name.startswith("coarse."):
