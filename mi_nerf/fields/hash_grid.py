@@ -7,6 +7,7 @@ vertices than the table has entries share them by hashing.
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -85,8 +86,7 @@ class HashGrid:
 
     def features(self, p: Any, table: Any) -> list[Any]:
         """The ``size`` features of the 3-vectors ``p`` in [−1, 1]³, one array each."""
-        self._encoding.data = table.array
-        unit = vector3_type(type(p[0]))(*(0.5 * p[i] + 0.5 for i in range(3)))
-        found = self._encoding(unit)
-        self._encoding.data = None
+        encoding = copy.copy(self._encoding)  # the table is this call's alone
+        encoding.data = table.array
+        found = encoding(vector3_type(type(p[0]))(*(0.5 * p[i] + 0.5 for i in range(3))))
         return [found[i] for i in range(self._config.size)]
