@@ -33,7 +33,8 @@ def upload(array_type: Any, values: Any) -> Any:
     flat = result.array if dr.is_tensor_v(array_type) else result
     if len(flat) == 0:
         return result
-    copy = flat + dr.opaque(type(flat), 0)
+    nothing = -0.0 if dr.is_float_v(flat) else 0  # −0 + 0 would be +0
+    copy = flat + dr.opaque(type(flat), nothing)
     dr.eval(copy)
     return array_type(copy, shape=result.shape) if dr.is_tensor_v(array_type) else copy
 
