@@ -64,7 +64,10 @@ class FusedNetwork:
         y = nn.matvec(views[layer.weight], x, views[layer.bias])
         if layer.sees:
             y = y + nn.matvec(views[layer.second_weight], seen)
-        return dr.maximum(y, 0) if layer.rectify else y
+        return self._rectified(y) if layer.rectify else y
+
+    def _rectified(self, y: Any) -> Any:
+        return dr.maximum(y, 0)
 
 
 class _ScaleGradient(dr.CustomOp):
@@ -98,7 +101,8 @@ class HalfNetwork(FusedNetwork):
 
     Weights, features and results are in single precision outside. Adjoints inside are
     ``loss_scale`` times what they are outside, so that small ones are not lost; where that
-    makes them overflow, gradients are not finite.
+    makes them overflow, gradients are not finite. Where activations overflow, on which the
+    scale has no influence, answers are NaN, and so is every loss made of them.
     """
 
     def __init__(self, config: NetworkConfig, weights: Mapping[str, Any], loss_scale: Any) -> None:
@@ -114,7 +118,12 @@ class HalfNetwork(FusedNetwork):
         direction = None if direction is None else [half(x) for x in direction]
         density, color = super().__call__(position, direction)
         raw = dr.custom(_ScaleGradient, [single(x) for x in (density, *color)], self._scale)
+        raw = [dr.select(dr.isfinite(x), x, dr.nan) for x in raw]  # activations have limits
         return raw[0], raw[1:]
+
+    def _rectified(self, y: Any) -> Any:
+        # The maximum would take NaN, and what negative infinity may stand for, for 0.
+        return y * dr.step(y, 0)
 
     def _pack(self, weights: dict[str, Any]) -> dict[str, Any]:
         weights = dr.custom(_ScaleGradient, weights, 1 / self._scale)
