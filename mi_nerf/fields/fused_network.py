@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 from drjit import nn
 
+from ..base.arrays import Floats
 from .network import GRID, Layer, NetworkConfig, evaluate
 
 WIDEST = 64  # neurons of a layer up to which this wins
@@ -39,7 +40,9 @@ class FusedNetwork:
             views: dict[str, Any] = nn.pack(dr.detach(weights), layout="inference")
         return views
 
-    def __call__(self, position: list[Any], direction: list[Any] | None) -> tuple[Any, list[Any]]:
+    def __call__(
+        self, position: list[Floats], direction: list[Floats] | None
+    ) -> tuple[Floats, list[Floats]]:
         """Raw density and the three raw colours of N queries, before their activations.
 
         Args:
@@ -51,11 +54,11 @@ class FusedNetwork:
         color = evaluate(self._config.color(), self._apply, h, direction=seen)
         return next(iter(density)), list(color)
 
-    def density(self, position: list[Any]) -> Any:
+    def density(self, position: list[Floats]) -> Floats:
         """Raw density of N queries alone."""
         return next(iter(self._apply(self._config.density(), self._trunk(position), None)))
 
-    def _trunk(self, position: list[Any]) -> Any:
+    def _trunk(self, position: list[Floats]) -> Any:
         x = nn.CoopVec(*position)
         return evaluate(self._config.trunk(), self._apply, x, position=x)
 
@@ -110,7 +113,9 @@ class HalfNetwork(FusedNetwork):
         self._scale = loss_scale
         super().__init__(config, weights)
 
-    def __call__(self, position: list[Any], direction: list[Any] | None) -> tuple[Any, list[Any]]:
+    def __call__(
+        self, position: list[Floats], direction: list[Floats] | None
+    ) -> tuple[Floats, list[Floats]]:
         """See :class:`FusedNetwork`."""
         half = dr.float16_array_t(type(position[0]))
         single = dr.float32_array_t(half)

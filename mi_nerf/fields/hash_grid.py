@@ -14,7 +14,7 @@ from typing import Any
 
 from drjit.nn import HashGridEncoding
 
-from ..base.arrays import vector3_type
+from ..base.arrays import Floats, Tensor, Vectors, vector3_type
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class HashGrid:
             raise RuntimeError("Dr.Jit lays out hash grids in another way than expected")
         self._encoding.data = None
 
-    def features(self, p: Any, table: Any) -> list[Any]:
+    def features(self, p: Vectors, table: Tensor) -> list[Floats]:
         """The ``size`` features of the 3-vectors ``p`` in [−1, 1]³, one array each."""
         encoding = copy.copy(self._encoding)  # the table is this call's alone
         encoding.data = table.array

@@ -20,6 +20,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
+from ..base.arrays import Floats, Tensor
 from .activations import relu
 
 GRID = "grid.table"  # the parameter that holds the features of a hash grid
@@ -154,7 +155,7 @@ class _AddBias(dr.CustomOp):
     Fused with the ReLU, only its result is kept for the backward pass.
     """
 
-    def eval(self, y: Any, bias: Any, rectify: bool) -> Any:
+    def eval(self, y: Tensor, bias: Tensor, rectify: bool) -> Any:
         """The ``(features, N)`` sum."""
         z = y + dr.reshape(bias, (bias.shape[0], 1))
         z = relu(z) if rectify else z
@@ -176,12 +177,12 @@ class _AddBias(dr.CustomOp):
         """Shown in Dr.Jit's graphs."""
         return "AddBias"
 
-    def _mask(self, gradient: Any) -> Any:
+    def _mask(self, gradient: Tensor) -> Tensor:
         return gradient if self._active is None else dr.select(self._active > 0, gradient, 0)
 
 
 def evaluate(
-    layers: Iterable[Layer], apply: Callable[[Layer, Any, Any], Any], x: Any, **features: Any
+    layers: Iterable[Layer], apply: Callable[[Layer, Any, Any], Any], x: Tensor, **features: Any
 ) -> Any:
     """What the last of the layers gives if the first one reads ``x``.
 
@@ -194,19 +195,19 @@ def evaluate(
     return x
 
 
-def trunk(config: NetworkConfig, weights: Mapping[str, Any], position: Any) -> Any:
+def trunk(config: NetworkConfig, weights: Mapping[str, Any], position: Tensor) -> Tensor:
     """The ``(width, N)`` activations that density and colour are read from."""
     return evaluate(config.trunk(), partial(_apply, weights), position, position=position)
 
 
-def density_head(config: NetworkConfig, weights: Mapping[str, Any], h: Any) -> Any:
+def density_head(config: NetworkConfig, weights: Mapping[str, Any], h: Tensor) -> Floats:
     """Raw density of N queries, before its activation."""
     return _apply(weights, config.density(), h, None).array
 
 
 def color_head(
-    config: NetworkConfig, weights: Mapping[str, Any], h: Any, direction: Any
-) -> list[Any]:
+    config: NetworkConfig, weights: Mapping[str, Any], h: Tensor, direction: Tensor
+) -> list[Floats]:
     """Raw colour of N queries, one array a channel; ``direction`` is γ(d) as a tensor."""
     raw = evaluate(config.color(), partial(_apply, weights), h, direction=direction)
     flat, count = raw.array, raw.shape[1]
@@ -215,7 +216,7 @@ def color_head(
     return [dr.gather(float_type, flat, column + i * count) for i in range(3)]
 
 
-def _apply(weights: Mapping[str, Any], layer: Layer, x: Any, seen: Any) -> Any:
+def _apply(weights: Mapping[str, Any], layer: Layer, x: Tensor, seen: Tensor) -> Tensor:
     y = weights[layer.weight] @ x
     if layer.sees:
         y = y + weights[layer.second_weight] @ seen

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import upload, vector3_type
+from ..base.arrays import Floats, Tensor, Vectors, upload, vector3_type
 from ..base.box import Corner
 from ..base.color import ColorSpace
 from ..base.kernel_stages import settled, stage
@@ -165,12 +165,12 @@ class NeuralField(Field):
         """A copy of all tensors as NumPy arrays."""
         return {name: np.array(tensor) for name, tensor in self._weights.items()}
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         raw = network.density_head(self.config.network, self._weights, self._trunk(p))
         return self._density(raw, p)
 
-    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+    def density_emission(self, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
         config = self.config
         if self._loss_scale is not None:
@@ -189,26 +189,26 @@ class NeuralField(Field):
             return None
         fused = FusedNetwork(config.network, self._weights)
 
-        def density_emission(p: Any, d: Any) -> tuple[Any, list[Any]]:
+        def density_emission(p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
             return self._answer(fused, p, d)
 
-        def density(p: Any) -> Any:
+        def density(p: Vectors) -> Floats:
             return self._density(fused.density(self._features(p)), p)
 
         return density_emission if emission else density
 
-    def _answer(self, fused: FusedNetwork, p: Any, d: Any) -> tuple[Any, list[Any]]:
+    def _answer(self, fused: FusedNetwork, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         config = self.config
         direction = config.direction.features(d) if config.network.view_dependent else None
         density, color = fused(self._features(p), direction)
         return self._density(density, p), self._color(color)
 
-    def _trunk(self, p: Any) -> Any:
+    def _trunk(self, p: Vectors) -> Tensor:
         with stage("encoding"):
             position = settled(stack_rows(self._features(p)))
         return network.trunk(self.config.network, self._weights, position)
 
-    def _features(self, p: Any) -> list[Any]:
+    def _features(self, p: Vectors) -> list[Floats]:
         config = self.config
         unit = vector3_type(type(p[0]))(
             *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
@@ -218,10 +218,10 @@ class NeuralField(Field):
             features += self._grid.features(unit, self._weights[network.GRID])
         return features
 
-    def _color(self, raw: list[Any]) -> list[Any]:
+    def _color(self, raw: list[Floats]) -> list[Floats]:
         return [apply_activation(self.config.color_activation, c) for c in raw]
 
-    def _density(self, raw: Any, p: Any) -> Any:
+    def _density(self, raw: Floats, p: Vectors) -> Floats:
         config = self.config
         raw = raw + config.density_shift
         if self._noise is not None:

@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from ..base.arrays import Floats, Vectors
 from ..base.box import Corner
 from ..base.color import ColorSpace
 from ..cameras.ndc import Ndc
@@ -28,11 +29,11 @@ class Field(ABC):
     coarse: Field | None = None  # says where this one is worth sampling (NeRF Sec. 5.2)
 
     @abstractmethod
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ ≥ 0 at N points, in 1/scene unit."""
 
     @abstractmethod
-    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+    def density_emission(self, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         """σ and the three channels of the emitted colour at N points along ``d``."""
 
     @abstractmethod

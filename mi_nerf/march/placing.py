@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats, Mask, Vectors
 from ..fields.protocol import Field
 from .importance import inverse_transform, merge_sorted
 from .intervals import ray_segments
@@ -20,12 +21,12 @@ from .strata import cell_widths, points_along, stratified
 
 def place_samples(
     field: Field,
-    o: Any,
-    d: Any,
+    o: Vectors,
+    d: Vectors,
     settings: MarchSettings,
     *,
     occupancy: OccupancyGrid | None = None,
-    jitter: Any = None,
+    jitter: Floats = None,
     bounds: tuple[Any, Any] | None = None,
 ) -> Samples:
     """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
@@ -57,10 +58,10 @@ def place_samples(
 
 def refine(
     samples: Samples,
-    weights: Any,
+    weights: Floats,
     fine: int,
     occupancy: OccupancyGrid | None = None,
-    jitter: Any = None,
+    jitter: Floats = None,
     hidden: float = 0.0,
 ) -> Samples:
     """Adds ``fine`` samples a ray where ``weights`` are large (NeRF Sec. 5.2).
@@ -88,7 +89,7 @@ def refine(
         return _select(merged, far > near, occupancy, hidden)
 
 
-def _select(samples: Samples, hit: Any, occupancy: OccupancyGrid | None, hidden: float) -> Samples:
+def _select(samples: Samples, hit: Mask, occupancy: OccupancyGrid | None, hidden: float) -> Samples:
     """Keeps for evaluation the samples that may lie in something, and may be seen."""
     dr.eval(samples.t, samples.delta, samples.near, samples.far)
     t = samples.t

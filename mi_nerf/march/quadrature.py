@@ -26,6 +26,7 @@ from typing import Any, Literal
 
 import drjit as dr
 
+from ..base.arrays import Floats
 from .strata import half_widths, neighbours
 
 Rule = Literal["constant", "cells", "linear"]
@@ -41,27 +42,27 @@ _MAX_DENSITY = 1e30  # its products with widths are finite
 class Composite:
     """What R rays see of a medium."""
 
-    color: list[Any]  # R values a channel: emission weighted along the ray, no background
-    opacity: Any  # R values in [0, 1]: 1 − transmittance of the whole ray
-    depth: Any  # R values: mean t under the weights; 0 where the opacity is 0
-    weights: Any  # R·S values: the share of each sample, summing to the opacity
+    color: list[Floats]  # R values a channel: emission weighted along the ray, no background
+    opacity: Floats  # R values in [0, 1]: 1 − transmittance of the whole ray
+    depth: Floats  # R values: mean t under the weights; 0 where the opacity is 0
+    weights: Floats  # R·S values: the share of each sample, summing to the opacity
 
 
-def one_minus_exp(x: Any) -> Any:
+def one_minus_exp(x: Floats) -> Floats:
     """1 − exp(−x) for x ≥ 0, accurate to a few ulp where the formula itself cancels."""
     small = x < 0.25
     y = dr.select(small, x, 0)
     return dr.select(small, y * _mean_series(y), 1 - dr.exp(-dr.select(small, 1, x)))
 
 
-def mean_transmittance(x: Any) -> Any:
+def mean_transmittance(x: Floats) -> Floats:
     """(1 − exp(−x))/x for x ≥ 0: the mean of exp(−ux) over 0 ≤ u ≤ 1."""
     small = x < 0.25
     y = dr.select(small, 1, x)
     return dr.select(small, _mean_series(dr.select(small, x, 0)), (1 - dr.exp(-y)) / y)
 
 
-def _mean_series(x: Any) -> Any:
+def _mean_series(x: Floats) -> Floats:
     """(1 − exp(−x))/x for 0 ≤ x ≤ 1/4, as 1 − x/2(1 − x/3(1 − …))."""
     factor = type(x)(1)
     for n in (8, 7, 6, 5, 4, 3, 2):
@@ -69,7 +70,7 @@ def _mean_series(x: Any) -> Any:
     return factor
 
 
-def sample_weights(density: Any, delta: Any, samples: int) -> tuple[Any, Any]:
+def sample_weights(density: Floats, delta: Floats, samples: int) -> tuple[Floats, Floats]:
     """Weights and opacities of the rules with constant density.
 
     Args:
@@ -86,7 +87,9 @@ def sample_weights(density: Any, delta: Any, samples: int) -> tuple[Any, Any]:
     return weights, one_minus_exp(dr.block_sum(tau, samples))
 
 
-def linear_weights(density: Any, t: Any, near: Any, far: Any, samples: int) -> tuple[Any, Any]:
+def linear_weights(
+    density: Floats, t: Floats, near: Floats, far: Floats, samples: int
+) -> tuple[Floats, Floats]:
     """Weights and opacities of the rule with linear density.
 
     Density is linear between samples and constant between the outer ones and the ends.
@@ -122,16 +125,16 @@ def linear_weights(density: Any, t: Any, near: Any, far: Any, samples: int) -> t
     return weights, one_minus_exp(dr.block_sum(tau, samples))
 
 
-def _opaque_at_most(tau: Any) -> Any:
+def _opaque_at_most(tau: Floats) -> Floats:
     """Limits optical depths; lets NaN through."""
     return dr.select(tau > MAX_OPTICAL_DEPTH, MAX_OPTICAL_DEPTH, tau)
 
 
 def composite(
-    density: Any,
+    density: Floats,
     emission: list[Any],
-    t: Any,
-    delta: Any,
+    t: Floats,
+    delta: Floats,
     samples: int,
     ends: tuple[Any, Any] | None = None,
 ) -> Composite:
@@ -155,6 +158,6 @@ def composite(
     return Composite(color, opacity, dr.select(visible, mean_t, 0), weights)
 
 
-def over_background(color: list[Any], opacity: Any, background: list[Any]) -> list[Any]:
+def over_background(color: list[Floats], opacity: Floats, background: list[Floats]) -> list[Floats]:
     """Places what the rays saw in front of ``background`` (one value or array a channel)."""
     return [c + (1 - opacity) * b for c, b in zip(color, background, strict=True)]

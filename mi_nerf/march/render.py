@@ -18,7 +18,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..base.arrays import gather_vector3
+from ..base.arrays import Floats, Vectors, gather_vector3
 from ..fields.protocol import Field
 from .occupancy import OccupancyGrid
 from .placing import place_samples
@@ -50,9 +50,9 @@ def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
 class RayImage:
     """What R rays see, without background, in the field's colour space."""
 
-    color: list[Any]  # three arrays of R values, premultiplied by the opacity
-    opacity: Any
-    depth: Any  # distance along the unit ray, scene units; 0 where nothing is seen
+    color: list[Floats]  # three arrays of R values, premultiplied by the opacity
+    opacity: Floats
+    depth: Floats  # distance along the unit ray, scene units; 0 where nothing is seen
     queries: int  # how often its networks were asked
 
 
@@ -65,12 +65,12 @@ def ray_chunks(rays: int, settings: MarchSettings) -> Iterator[tuple[int, int]]:
 
 def render_rays(
     field: Field,
-    o: Any,
-    d: Any,
+    o: Vectors,
+    d: Vectors,
     settings: MarchSettings,
     *,
     occupancy: OccupancyGrid | None = None,
-    jitter: Any = None,
+    jitter: Floats = None,
 ) -> RayImage:
     """Renders R rays without derivatives, in chunks of bounded memory.
 
@@ -99,7 +99,9 @@ def render_rays(
     return RayImage(outputs[:3], outputs[3], outputs[4], queries)
 
 
-def slice_rays(o: Any, d: Any, jitter: Any, start: int, size: int) -> tuple[Any, Any, Any, Any]:
+def slice_rays(
+    o: Vectors, d: Vectors, jitter: Floats, start: int, size: int
+) -> tuple[Any, Any, Any, Any]:
     """Rays ``start … start + size`` of a batch, with their indices and jitter."""
     float_type = type(o[0])
     uint = dr.uint32_array_t(float_type)

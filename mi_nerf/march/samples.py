@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats, Indices, Vectors
 from ..cameras.ndc import NdcRays
 from .quadrature import Rule
 from .strata import cell_edges, stratum_edges
@@ -16,15 +17,15 @@ from .strata import cell_edges, stratum_edges
 class Samples:
     """R·S samples of R rays, and which of them the field has to be asked about."""
 
-    o: Any  # R origins, in the space where the field lives
-    d: Any  # R unit directions in that space
-    view: Any  # R unit directions in scene space, along which the field emits
-    t: Any  # R·S sample parameters
-    delta: Any  # R·S interval lengths
+    o: Vectors  # R origins, in the space where the field lives
+    d: Vectors  # R unit directions in that space
+    view: Vectors  # R unit directions in scene space, along which the field emits
+    t: Floats  # R·S sample parameters
+    delta: Floats  # R·S interval lengths
     count: int  # S
-    near: Any  # R bounds of t
-    far: Any
-    index: Any = None  # the M samples to evaluate, ascending
+    near: Floats  # R bounds of t
+    far: Floats
+    index: Indices = None  # the M samples to evaluate, ascending
     coarse_queries: int = 0  # of the coarse network, by which the samples were placed
     ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
     rule: Rule = "constant"
@@ -40,7 +41,7 @@ class Samples:
         """M."""
         return len(self.index)
 
-    def edges(self) -> Any:
+    def edges(self) -> Floats:
         """R·(S + 1) ascending ends of the intervals: sample s lies between s and s + 1."""
         if self.even:
             return stratum_edges(self.near, self.far, self.count)

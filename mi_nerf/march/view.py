@@ -9,15 +9,13 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import vector3_type
+from ..base.arrays import Image, vector3_type
 from ..base.color import linear_to_srgb
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from ..fields.protocol import Field
 from .occupancy import OccupancyGrid
 from .render import render_rays
 from .settings import MarchSettings
-
-Image = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)

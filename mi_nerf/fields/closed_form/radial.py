@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
+from ...base.arrays import Floats, Vectors
 from ...base.box import Corner
 from .base import ClosedFormConfig, ClosedFormField, number, rise
 
@@ -39,7 +39,7 @@ class GaussianConfig(ClosedFormConfig):
 class GaussianField(ClosedFormField):
     """:class:`GaussianConfig` as a field."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         offset = (p - self.vector("center", p)) / self.scalar("width", p)
         return self.scalar("peak", p) * dr.exp(-0.5 * dr.squared_norm(offset))
@@ -79,7 +79,7 @@ class ShellConfig(ClosedFormConfig):
 class ShellField(ClosedFormField):
     """:class:`ShellConfig` as a field."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         square = dr.squared_norm(p - self.vector("center", p))
         r = dr.sqrt(dr.maximum(square, dr.smallest(type(square))))  # finite slope in the centre
