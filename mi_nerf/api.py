@@ -15,12 +15,12 @@ from typing import Any, Literal
 import mitsuba as mi
 
 from . import generation
+from .base.arrays import Image
 from .base.checks import positive, valid_seed
 from .base.errors import InputError, Option
 from .base.progress_bar import progress_bar
 from .base.variants import available_variants, choose_variant
 from .data import Dataset
-from .march.view import Image
 from .scene_xml.library import find_scene
 from .tasks import describe as info
 from .tasks import evaluate as evaluation

@@ -15,10 +15,19 @@ Layout convention used throughout the package:
 from __future__ import annotations
 
 import sys
-from typing import Any
+from typing import Any, TypeAlias
 
 import drjit as dr
 import numpy as np
+
+# Dr.Jit's types depend on backend and precision, so these say to readers what a value is:
+Floats: TypeAlias = Any  # numbers, one each of rays, samples or queries
+Vectors: TypeAlias = Any  # 3-vectors, likewise
+Mask: TypeAlias = Any  # truth values, likewise
+Indices: TypeAlias = Any  # unsigned numbers of rays, samples or cells, likewise
+Tensor: TypeAlias = Any  # (features, N) activations, or a parameter of any shape
+
+Image: TypeAlias = np.ndarray[Any, Any]  # (height, width, channels) numbers
 
 _CACHE_LINE = 64  # bytes
 
@@ -33,7 +42,8 @@ def upload(array_type: Any, values: Any) -> Any:
     flat = result.array if dr.is_tensor_v(array_type) else result
     if len(flat) == 0:
         return result
-    copy = flat + dr.opaque(type(flat), 0)
+    nothing = -0.0 if dr.is_float_v(flat) else 0  # −0 + 0 would be +0
+    copy = flat + dr.opaque(type(flat), nothing)
     dr.eval(copy)
     return array_type(copy, shape=result.shape) if dr.is_tensor_v(array_type) else copy
 
@@ -62,7 +72,7 @@ def _array(kind: str, float_type: type) -> Any:
     return getattr(sys.modules[float_type.__module__], kind + suffix)
 
 
-def gather_vector3(source: Any, index: Any) -> Any:
+def gather_vector3(source: Vectors, index: Indices) -> Vectors:
     """Gathers the three components of ``source`` at ``index``, as an ``Array3``."""
     float_type = type(source[0])
     return vector3_type(float_type)(*(dr.gather(float_type, source[i], index) for i in range(3)))

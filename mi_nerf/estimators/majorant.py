@@ -11,7 +11,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..base.arrays import upload
+from ..base.arrays import Floats, Vectors, upload
 from ..base.box import grid_shape
 from ..fields.protocol import Field
 from ..march.occupancy import OccupancyGrid
@@ -82,13 +82,15 @@ class Majorants:
         """(X, Y, Z) densities, 1/scene unit."""
         return np.array(self._bits).view(np.float32).reshape(self.shape)
 
-    def raise_to(self, cell: Any, density: Any) -> None:
+    def raise_to(self, cell: Any, density: Floats) -> None:
         """Brings cells up to densities that were met in them."""
         bits = dr.reinterpret_array(self._uint, dr.maximum(density, 0))
         dr.scatter_reduce(dr.ReduceOp.Max, self._bits, bits, cell)
         dr.eval(self._bits)
 
-    def collide(self, o: Any, d: Any, t: Any, far: Any, depth: Any) -> tuple[Any, Any, Any]:
+    def collide(
+        self, o: Vectors, d: Vectors, t: Floats, far: Floats, depth: Floats
+    ) -> tuple[Any, Any, Any]:
         """Where rays have passed an optical depth of the majorants (Amanatides & Woo 1987).
 
         Args:
@@ -117,7 +119,7 @@ class Majorants:
             return dr.select(parallel[i], dr.inf, (edge - o[i]) * rate[i])
 
         def body(
-            t: Any, depth: Any, density: Any, flat: Any, going: Any, *cell: Any
+            t: Floats, depth: Floats, density: Floats, flat: Any, going: Any, *cell: Any
         ) -> tuple[Any, ...]:
             ends = [leave(cell, i) for i in range(3)]
             first = dr.minimum(dr.minimum(ends[0], ends[1]), ends[2])

@@ -28,13 +28,13 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import upload, vector3_type
+from ..base.arrays import Floats, Vectors, upload, vector3_type
 from ..fields.protocol import Field
 from ..march.intervals import RaySegments, ray_segments
 from ..march.occupancy import OccupancyGrid
 
 Array = NDArray[np.float64]
-Ask = Callable[[Any, Any], tuple[Any, list[Any]]]
+Ask = Callable[[Vectors, Vectors], tuple[Floats, list[Floats]]]
 
 # Observed orders that differ from 2 by more than this do not count as second order.
 _ORDER_TOLERANCE = 0.5
@@ -59,8 +59,8 @@ class Reference:
 
 def reference(
     field: Field,
-    o: Any,
-    d: Any,
+    o: Vectors,
+    d: Vectors,
     *,
     occupancy: OccupancyGrid | None = None,
     bounds: tuple[Any, Any] = (None, None),
@@ -180,8 +180,8 @@ class _March:
     def __init__(
         self,
         field: Field,
-        o: Any,
-        d: Any,
+        o: Vectors,
+        d: Vectors,
         occupancy: OccupancyGrid | None,
         bounds: tuple[Any, Any],
         block: int,
@@ -189,8 +189,7 @@ class _March:
         self._float = type(o[0])
         self._occupancy = occupancy
         self._block = block
-        fused = getattr(field, "fused", None)
-        self._ask: Ask = (None if fused is None else fused()) or field.density_emission
+        self._ask: Ask = field.fused() or field.density_emission
         double = dr.float64_array_t(self._float)
         vector3 = vector3_type(double)
         limits = tuple(b if b is None or isinstance(b, int | float) else double(b) for b in bounds)
@@ -271,7 +270,7 @@ class _March:
             part = index[start : start + self._block]
             yield part, np.pad(part, (0, self._block - len(part)), mode="edge")
 
-    def _vectors(self, v: Array) -> Any:
+    def _vectors(self, v: Array) -> Vectors:
         return vector3_type(self._float)(*(upload(self._float, row) for row in v.T))
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..base.arrays import gather_vector3
+from ..base.arrays import Floats, Indices, gather_vector3
 from ..fields.protocol import Field
 from ..march.intervals import RaySegments
 from ..march.strata import points_along
@@ -41,8 +41,8 @@ _SMALL_BLOCK = 1024
 class Tracked:
     """An estimate of what each of R rays sees, without background; R values each."""
 
-    color: list[Any]  # three channels, in the field's colour space
-    opacity: Any  # one minus the transmittance: right on average, not within [0, 1]
+    color: list[Floats]  # three channels, in the field's colour space
+    opacity: Floats  # one minus the transmittance: right on average, not within [0, 1]
     queries: int  # collisions of all rays
 
 
@@ -50,12 +50,12 @@ class Tracked:
 class _Live:
     """Rays under way."""
 
-    ray: Any  # its number
-    t: Any  # how far it has come
-    through: Any  # T
+    ray: Indices  # its number
+    t: Floats  # how far it has come
+    through: Floats  # T
     random: Any  # generators, one a ray
 
-    def keep(self, where: Any) -> _Live:
+    def keep(self, where: Indices) -> _Live:
         """Those in the slots ``where``."""
         ray, t, through, random = (
             dr.gather(type(v), v, where) for v in (self.ray, self.t, self.through, self.random)
@@ -178,12 +178,11 @@ class _Asker:
     """Density and emission where rays collide, in blocks that compile once."""
 
     def __init__(self, field: Field, block: int) -> None:
-        fused = getattr(field, "fused", None)
-        self._fused = None if fused is None else fused()
+        self._fused = field.fused()
         self._ask = self._fused or field.density_emission
         self._block = block
 
-    def __call__(self, segments: RaySegments, live: _Live) -> tuple[Any, list[Any]]:
+    def __call__(self, segments: RaySegments, live: _Live) -> tuple[Floats, list[Floats]]:
         count = len(live.ray)
         if self._fused is not None:
             return self._query(segments, live)
@@ -202,7 +201,7 @@ class _Asker:
             start += size
         return outputs[0], outputs[1:]
 
-    def _query(self, segments: RaySegments, live: _Live) -> tuple[Any, list[Any]]:
+    def _query(self, segments: RaySegments, live: _Live) -> tuple[Floats, list[Floats]]:
         p = points_along(segments.o, segments.d, live.t, live.ray)
         density, emission = self._ask(p, gather_vector3(segments.view, live.ray))
         dr.eval(density, emission)

@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import drjit as dr
 
-from ..base.arrays import array_type
+from ..base.arrays import Floats, Tensor, Vectors, array_type
 
 Convention = Literal["pi", "one", "two_pi"]
 
@@ -50,7 +50,7 @@ class FourierEncoding:
         """Number of features of a 3-vector."""
         return 3 * (2 * self.frequencies + int(self.include_input))
 
-    def features(self, p: Any) -> list[Any]:
+    def features(self, p: Vectors) -> list[Floats]:
         """The ``size`` features of the 3-vectors ``p``, as a list of per-query arrays."""
         result = [p[i] for i in range(3)] if self.include_input else []
         for k in range(self.frequencies):
@@ -58,12 +58,12 @@ class FourierEncoding:
             result += [s for s, _ in pairs] + [c for _, c in pairs]
         return result
 
-    def __call__(self, p: Any) -> Any:
+    def __call__(self, p: Vectors) -> Any:
         """Encodes N 3-vectors into a ``(size, N)`` tensor."""
         return stack_rows(self.features(p))
 
 
-def sincos_octave(x: Any, k: int, convention: Convention) -> tuple[Any, Any]:
+def sincos_octave(x: Floats, k: int, convention: Convention) -> tuple[Floats, Floats]:
     """``(sin, cos)`` of s·2^k·x to about 5e-7 for every k, with s = π, 1 or 2π."""
     scaled = x * float(2**k)  # exact
     if convention == "one":
@@ -84,7 +84,7 @@ class _StackRows(dr.CustomOp):
     own; here every row is written once, and a gather is all that is needed.
     """
 
-    def eval(self, rows: list[Any]) -> Any:
+    def eval(self, rows: list[Floats]) -> Any:
         """F arrays of N values, or of one, as an ``(F, N)`` tensor."""
         float_type = type(rows[0])
         self._sizes = [len(row) for row in rows]
@@ -114,6 +114,6 @@ class _StackRows(dr.CustomOp):
         return "StackRows"
 
 
-def stack_rows(rows: list[Any]) -> Any:
+def stack_rows(rows: list[Floats]) -> Tensor:
     """Writes F arrays of N values into one ``(F, N)`` tensor, in a single kernel."""
     return dr.custom(_StackRows, rows)

@@ -15,16 +15,17 @@ from typing import Any
 import drjit as dr
 from drjit import nn
 
-from .network import GRID, NetworkConfig
+from ..base.arrays import Floats
+from .network import GRID, Layer, NetworkConfig, evaluate
 
 WIDEST = 64  # neurons of a layer up to which this wins
 
 
 def worth_fusing(config: NetworkConfig, float_type: Any) -> bool:
     """Whether a network is narrow enough, and the backend one on which this was measured."""
-    widths = [config.width] + [config.view_width] * (config.view_depth > 0)
+    widest = max(layer.outputs for layer in config.layers())
     single = dr.type_v(float_type) == dr.VarType.Float32
-    return max(widths) <= WIDEST and single and dr.backend_v(float_type) == dr.JitBackend.LLVM
+    return widest <= WIDEST and single and dr.backend_v(float_type) == dr.JitBackend.LLVM
 
 
 class FusedNetwork:
@@ -39,40 +40,37 @@ class FusedNetwork:
             views: dict[str, Any] = nn.pack(dr.detach(weights), layout="inference")
         return views
 
-    def __call__(self, position: list[Any], direction: list[Any] | None) -> tuple[Any, list[Any]]:
+    def __call__(
+        self, position: list[Floats], direction: list[Floats] | None
+    ) -> tuple[Floats, list[Floats]]:
         """Raw density and the three raw colours of N queries, before their activations.
 
         Args:
             position, direction: features, one array of N values each.
         """
-        config, h = self._config, self._trunk(position)
-        v = None if direction is None else nn.CoopVec(*direction)
-        density = self._layer("density", h, {})
-        if config.feature_layer:
-            h = self._layer("feature", h, {}, rectify=config.feature_relu)
-        seen = {} if v is None else {"direction_weight": v}
-        for i in range(config.view_depth):
-            h = self._layer(f"view_{i}", h, seen if i == 0 else {}, rectify=True)
-        color = self._layer("color", h, seen if config.view_depth == 0 else {})
+        h = self._trunk(position)
+        seen = None if direction is None else nn.CoopVec(*direction)
+        density = self._apply(self._config.density(), h, None)
+        color = evaluate(self._config.color(), self._apply, h, direction=seen)
         return next(iter(density)), list(color)
 
-    def density(self, position: list[Any]) -> Any:
+    def density(self, position: list[Floats]) -> Floats:
         """Raw density of N queries alone."""
-        return next(iter(self._layer("density", self._trunk(position), {})))
+        return next(iter(self._apply(self._config.density(), self._trunk(position), None)))
 
-    def _trunk(self, position: list[Any]) -> Any:
-        x = h = nn.CoopVec(*position)
-        for i in range(self._config.depth):
-            extra = {"position_weight": x} if i == self._config.skip else {}
-            h = self._layer(f"trunk_{i}", h, extra, rectify=True)
-        return h
+    def _trunk(self, position: list[Floats]) -> Any:
+        x = nn.CoopVec(*position)
+        return evaluate(self._config.trunk(), self._apply, x, position=x)
 
-    def _layer(self, name: str, x: Any, extra: dict[str, Any], *, rectify: bool = False) -> Any:
+    def _apply(self, layer: Layer, x: Any, seen: Any) -> Any:
         views = self._views
-        y = nn.matvec(views[f"{name}.weight"], x, views[f"{name}.bias"])
-        for kind, value in extra.items():
-            y = y + nn.matvec(views[f"{name}.{kind}"], value)
-        return dr.maximum(y, 0) if rectify else y
+        y = nn.matvec(views[layer.weight], x, views[layer.bias])
+        if layer.sees:
+            y = y + nn.matvec(views[layer.second_weight], seen)
+        return self._rectified(y) if layer.rectify else y
+
+    def _rectified(self, y: Any) -> Any:
+        return dr.maximum(y, 0)
 
 
 class _ScaleGradient(dr.CustomOp):
@@ -106,7 +104,8 @@ class HalfNetwork(FusedNetwork):
 
     Weights, features and results are in single precision outside. Adjoints inside are
     ``loss_scale`` times what they are outside, so that small ones are not lost; where that
-    makes them overflow, gradients are not finite.
+    makes them overflow, gradients are not finite. Where activations overflow, on which the
+    scale has no influence, answers are NaN, and so is every loss made of them.
     """
 
     def __init__(self, config: NetworkConfig, weights: Mapping[str, Any], loss_scale: Any) -> None:
@@ -114,7 +113,9 @@ class HalfNetwork(FusedNetwork):
         self._scale = loss_scale
         super().__init__(config, weights)
 
-    def __call__(self, position: list[Any], direction: list[Any] | None) -> tuple[Any, list[Any]]:
+    def __call__(
+        self, position: list[Floats], direction: list[Floats] | None
+    ) -> tuple[Floats, list[Floats]]:
         """See :class:`FusedNetwork`."""
         half = dr.float16_array_t(type(position[0]))
         single = dr.float32_array_t(half)
@@ -122,7 +123,12 @@ class HalfNetwork(FusedNetwork):
         direction = None if direction is None else [half(x) for x in direction]
         density, color = super().__call__(position, direction)
         raw = dr.custom(_ScaleGradient, [single(x) for x in (density, *color)], self._scale)
+        raw = [dr.select(dr.isfinite(x), x, dr.nan) for x in raw]  # activations have limits
         return raw[0], raw[1:]
+
+    def _rectified(self, y: Any) -> Any:
+        # The maximum would take NaN, and what negative infinity may stand for, for 0.
+        return y * dr.step(y, 0)
 
     def _pack(self, weights: dict[str, Any]) -> dict[str, Any]:
         weights = dr.custom(_ScaleGradient, weights, 1 / self._scale)

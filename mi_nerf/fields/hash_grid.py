@@ -7,13 +7,14 @@ vertices than the table has entries share them by hashing.
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Any
 
 from drjit.nn import HashGridEncoding
 
-from ..base.arrays import vector3_type
+from ..base.arrays import Floats, Tensor, Vectors, vector3_type
 
 
 @dataclass(frozen=True)
@@ -83,10 +84,9 @@ class HashGrid:
             raise RuntimeError("Dr.Jit lays out hash grids in another way than expected")
         self._encoding.data = None
 
-    def features(self, p: Any, table: Any) -> list[Any]:
+    def features(self, p: Vectors, table: Tensor) -> list[Floats]:
         """The ``size`` features of the 3-vectors ``p`` in [−1, 1]³, one array each."""
-        self._encoding.data = table.array
-        unit = vector3_type(type(p[0]))(*(0.5 * p[i] + 0.5 for i in range(3)))
-        found = self._encoding(unit)
-        self._encoding.data = None
+        encoding = copy.copy(self._encoding)  # the table is this call's alone
+        encoding.data = table.array
+        found = encoding(vector3_type(type(p[0]))(*(0.5 * p[i] + 0.5 for i in range(3))))
         return [found[i] for i in range(self._config.size)]

@@ -12,16 +12,50 @@ Queries are the columns of ``(features, N)`` tensors.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from ..base.arrays import Floats, Tensor
 from .activations import relu
 
 GRID = "grid.table"  # the parameter that holds the features of a hash grid
 _GRID_START = 1e-4  # its entries start within plus or minus this (Müller et al. 2022)
+DENSITY, FEATURE, COLOR = "density", "feature", "color"  # layers that start as linear ones
+
+
+@dataclass(frozen=True)
+class Layer:
+    """y = W·x + b, perhaps with a second matrix for features that it sees besides x."""
+
+    name: str
+    reads: str  # where x comes from: the name of another layer, or "position"
+    outputs: int
+    sees: str | None = None  # "position" or "direction"
+    rectify: bool = False  # a ReLU follows
+
+    @property
+    def weight(self) -> str:
+        """The name of W."""
+        return f"{self.name}.weight"
+
+    @property
+    def second_weight(self) -> str:
+        """The name of the second matrix, if there is one."""
+        return f"{self.name}.{self.sees}_weight"
+
+    @property
+    def bias(self) -> str:
+        """The name of b."""
+        return f"{self.name}.bias"
+
+    def matrices(self) -> dict[str, str]:
+        """The names of the matrices, and of what each is multiplied with."""
+        return {self.weight: self.reads} | ({self.second_weight: self.sees} if self.sees else {})
 
 
 @dataclass(frozen=True)
@@ -49,31 +83,43 @@ class NetworkConfig:
         if self.feature_relu and not self.feature_layer:
             raise ValueError("network: feature_relu=True, expected feature_layer=True with it")
 
+    def trunk(self) -> list[Layer]:
+        """The layers whose last outputs density and colour are read from."""
+        names = ["position", *(f"trunk_{i}" for i in range(self.depth))]
+        return [
+            Layer(names[i + 1], names[i], self.width, "position" if i == self.skip else None, True)
+            for i in range(self.depth)
+        ]
+
+    def density(self) -> Layer:
+        """The head that density is read from."""
+        return Layer(DENSITY, f"trunk_{self.depth - 1}", 1)
+
+    def color(self) -> list[Layer]:
+        """The layers from the trunk to the three channels."""
+        layers, last = [], f"trunk_{self.depth - 1}"
+        if self.feature_layer:
+            layers.append(Layer(FEATURE, last, self.width, rectify=self.feature_relu))
+            last = FEATURE
+        seen = "direction" if self.view_dependent else None  # by the first of the following
+        for i in range(self.view_depth):
+            layers.append(Layer(f"view_{i}", last, self.view_width, seen, True))
+            last, seen = f"view_{i}", None
+        return [*layers, Layer(COLOR, last, 3, seen)]
+
+    def layers(self) -> list[Layer]:
+        """All of them; none comes before what it reads."""
+        return [*self.trunk(), self.density(), *self.color()]
+
     def shapes(self, position_size: int, direction_size: int) -> dict[str, tuple[int, ...]]:
         """Names and shapes of all parameters; weights are ``(outputs, inputs)``."""
         shapes: dict[str, tuple[int, ...]] = {}
-
-        def layer(name: str, outputs: int, **inputs: int) -> int:
-            for kind, size in inputs.items():
-                shapes[f"{name}.{kind}"] = (outputs, size)
-            shapes[f"{name}.bias"] = (outputs,)
-            return outputs
-
-        size = position_size
-        for i in range(self.depth):
-            extra = {"position_weight": position_size} if i == self.skip else {}
-            size = layer(f"trunk_{i}", self.width, weight=size, **extra)
-        layer("density", 1, weight=size)
-        if self.feature_layer:
-            size = layer("feature", self.width, weight=size)
-        if self.view_depth == 0 and self.view_dependent:
-            layer("color", 3, weight=size, direction_weight=direction_size)
-            return shapes
-        for i in range(self.view_depth):
-            first = i == 0 and self.view_dependent
-            extra = {"direction_weight": direction_size} if first else {}
-            size = layer(f"view_{i}", self.view_width, weight=size, **extra)
-        layer("color", 3, weight=size)
+        sizes = {"position": position_size, "direction": direction_size}
+        for layer in self.layers():
+            for name, source in layer.matrices().items():
+                shapes[name] = (layer.outputs, sizes[source])
+            shapes[layer.bias] = (layer.outputs,)
+            sizes[layer.name] = layer.outputs
         return shapes
 
 
@@ -95,7 +141,7 @@ def initial_weights(
             result[name] = np.zeros(shape, np.float32)
             continue
         inputs = sum(s[1] for n, s in shapes.items() if n.startswith(layer + ".") and len(s) == 2)
-        linear = layer in ("density", "feature", "color")
+        linear = layer in (DENSITY, FEATURE, COLOR)
         variance = 2 / (inputs + shape[0]) if linear else 2 / inputs
         result[name] = rng.normal(0, math.sqrt(variance), shape).astype(np.float32)
     return result
@@ -109,7 +155,7 @@ class _AddBias(dr.CustomOp):
     Fused with the ReLU, only its result is kept for the backward pass.
     """
 
-    def eval(self, y: Any, bias: Any, rectify: bool) -> Any:
+    def eval(self, y: Tensor, bias: Tensor, rectify: bool) -> Any:
         """The ``(features, N)`` sum."""
         z = y + dr.reshape(bias, (bias.shape[0], 1))
         z = relu(z) if rectify else z
@@ -131,42 +177,47 @@ class _AddBias(dr.CustomOp):
         """Shown in Dr.Jit's graphs."""
         return "AddBias"
 
-    def _mask(self, gradient: Any) -> Any:
+    def _mask(self, gradient: Tensor) -> Tensor:
         return gradient if self._active is None else dr.select(self._active > 0, gradient, 0)
 
 
-def _layer(
-    weights: dict[str, Any], name: str, x: Any, extra: dict[str, Any], *, rectify: bool = False
+def evaluate(
+    layers: Iterable[Layer], apply: Callable[[Layer, Any, Any], Any], x: Tensor, **features: Any
 ) -> Any:
-    y = weights[f"{name}.weight"] @ x
-    for kind, value in extra.items():
-        y = y + weights[f"{name}.{kind}"] @ value
-    return dr.custom(_AddBias, y, weights[f"{name}.bias"], rectify)
+    """What the last of the layers gives if the first one reads ``x``.
+
+    Args:
+        apply: one layer's outputs, of what it reads and of the features that it sees.
+        features: by what the layers call them.
+    """
+    for layer in layers:
+        x = apply(layer, x, features[layer.sees] if layer.sees else None)
+    return x
 
 
-def trunk(config: NetworkConfig, weights: dict[str, Any], position: Any) -> Any:
+def trunk(config: NetworkConfig, weights: Mapping[str, Any], position: Tensor) -> Tensor:
     """The ``(width, N)`` activations that density and colour are read from."""
-    h = position
-    for i in range(config.depth):
-        extra = {"position_weight": position} if i == config.skip else {}
-        h = _layer(weights, f"trunk_{i}", h, extra, rectify=True)
-    return h
+    return evaluate(config.trunk(), partial(_apply, weights), position, position=position)
 
 
-def density_head(weights: dict[str, Any], h: Any) -> Any:
+def density_head(config: NetworkConfig, weights: Mapping[str, Any], h: Tensor) -> Floats:
     """Raw density of N queries, before its activation."""
-    return _layer(weights, "density", h, {}).array
+    return _apply(weights, config.density(), h, None).array
 
 
-def color_head(config: NetworkConfig, weights: dict[str, Any], h: Any, direction: Any) -> list[Any]:
+def color_head(
+    config: NetworkConfig, weights: Mapping[str, Any], h: Tensor, direction: Tensor
+) -> list[Floats]:
     """Raw colour of N queries, one array a channel; ``direction`` is γ(d) as a tensor."""
-    if config.feature_layer:
-        h = _layer(weights, "feature", h, {}, rectify=config.feature_relu)
-    seen = {"direction_weight": direction} if config.view_dependent else {}
-    for i in range(config.view_depth):
-        h = _layer(weights, f"view_{i}", h, seen if i == 0 else {}, rectify=True)
-    raw = _layer(weights, "color", h, seen if config.view_depth == 0 else {})
+    raw = evaluate(config.color(), partial(_apply, weights), h, direction=direction)
     flat, count = raw.array, raw.shape[1]
     float_type = type(flat)
     column = dr.arange(dr.uint32_array_t(float_type), count)
     return [dr.gather(float_type, flat, column + i * count) for i in range(3)]
+
+
+def _apply(weights: Mapping[str, Any], layer: Layer, x: Tensor, seen: Tensor) -> Tensor:
+    y = weights[layer.weight] @ x
+    if layer.sees:
+        y = y + weights[layer.second_weight] @ seen
+    return dr.custom(_AddBias, y, weights[layer.bias], layer.rectify)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arrays import upload, vector3_type
+from ..base.arrays import Floats, Tensor, Vectors, upload, vector3_type
 from ..base.box import Corner
 from ..base.color import ColorSpace
 from ..base.kernel_stages import settled, stage
@@ -21,6 +22,7 @@ from .fused_network import FusedNetwork, HalfNetwork, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
 from .network import NetworkConfig
 from .noise import DensityNoise
+from .protocol import Field
 
 
 @dataclass(frozen=True)
@@ -91,18 +93,19 @@ class NeuralFieldConfig:
         return max(b - a for a, b in zip(self.lower, self.upper, strict=True)) / 2
 
 
-class NeuralField:
+class NeuralField(Field):
     """Features of position and direction into an MLP (NeRF Sec. 4 and 5.1)."""
 
-    coarse: NeuralField | None = None  # says where this one is worth sampling (Sec. 5.2)
-    noise: DensityNoise | None = None  # added to raw densities, in training
-    loss_scale: Any = None  # one value, in training: the network runs in half precision
+    coarse: NeuralField | None
+    _noise: DensityNoise | None = None  # added to raw densities, in training
+    _loss_scale: Any = None  # one value, in training: the network runs in half precision
 
     def __init__(
         self,
         config: NeuralFieldConfig,
         weights: Mapping[str, np.ndarray[Any, Any]],
         tensor_type: Any,
+        coarse: NeuralField | None = None,
     ) -> None:
         """Uploads ``weights`` as ``tensor_type`` (such as ``mi.TensorXf``).
 
@@ -111,7 +114,7 @@ class NeuralField:
         """
         self.config = config
         self.lower, self.upper, self.color_space = config.lower, config.upper, config.color_space
-        self.ndc = config.ndc
+        self.ndc, self.coarse = config.ndc, coarse
         shapes = config.shapes()
         if unknown := sorted(set(weights) - set(shapes)):
             raise ValueError(f"unexpected tensor '{unknown[0]}' for this architecture")
@@ -126,9 +129,33 @@ class NeuralField:
             self._grid = HashGrid(config.grid, type(self._weights[network.GRID].array))
 
     @classmethod
-    def create(cls, config: NeuralFieldConfig, seed: int, tensor_type: Any) -> NeuralField:
+    def create(
+        cls,
+        config: NeuralFieldConfig,
+        seed: int,
+        tensor_type: Any,
+        coarse: NeuralField | None = None,
+    ) -> NeuralField:
         """A field with freshly initialised weights."""
-        return cls(config, network.initial_weights(config.shapes(), seed), tensor_type)
+        return cls(config, network.initial_weights(config.shapes(), seed), tensor_type, coarse)
+
+    def for_training(
+        self, noise: float = 0.0, seed: int = 0, loss_scale: Any = None
+    ) -> NeuralField:
+        """This field with the same weights, as one step of training looks at it.
+
+        Args:
+            noise: standard deviation of what is added to raw densities (NeRF, appendix A).
+            seed: of the noise; the coarse field's is the next one.
+            loss_scale: an array of one value, with which the network runs in half
+                precision; see :class:`mi_nerf.fields.fused_network.HalfNetwork`.
+        """
+        view = copy.copy(self)
+        view._noise = DensityNoise(noise, seed) if noise > 0 else None
+        view._loss_scale = loss_scale
+        if self.coarse is not None:
+            view.coarse = self.coarse.for_training(noise, seed + 1, loss_scale)
+        return view
 
     def parameters(self) -> dict[str, Any]:
         """The network's tensors by name; assign with ``tensor[:] = …`` or replace the entry."""
@@ -138,51 +165,50 @@ class NeuralField:
         """A copy of all tensors as NumPy arrays."""
         return {name: np.array(tensor) for name, tensor in self._weights.items()}
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
-        return self._density(network.density_head(self._weights, self._trunk(p)), p)
+        raw = network.density_head(self.config.network, self._weights, self._trunk(p))
+        return self._density(raw, p)
 
-    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+    def density_emission(self, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         """σ in 1/scene unit and the colour emitted along ``d``, in ``color_space``."""
         config = self.config
-        if self.loss_scale is not None:
-            return self._answer(HalfNetwork(config.network, self._weights, self.loss_scale), p, d)
+        if self._loss_scale is not None:
+            return self._answer(HalfNetwork(config.network, self._weights, self._loss_scale), p, d)
         h = self._trunk(p)
         with stage("encoding"):
             direction = settled(config.direction(d)) if config.network.view_dependent else None
         raw = network.color_head(config.network, self._weights, h, direction)
-        return self._density(network.density_head(self._weights, h), p), self._color(raw)
+        density = network.density_head(config.network, self._weights, h)
+        return self._density(density, p), self._color(raw)
 
     def fused(self, emission: bool = True) -> Callable[..., Any] | None:
-        """:meth:`density_emission` of the weights as they are, as one kernel without gradients.
-
-        Without ``emission``, :meth:`density`. ``None`` where that would be slower.
-        """
+        """See :meth:`Field.fused`; ``None`` where that would be slower."""
         config = self.config
         if not worth_fusing(config.network, type(next(iter(self._weights.values())).array)):
             return None
         fused = FusedNetwork(config.network, self._weights)
 
-        def density_emission(p: Any, d: Any) -> tuple[Any, list[Any]]:
+        def density_emission(p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
             return self._answer(fused, p, d)
 
-        def density(p: Any) -> Any:
+        def density(p: Vectors) -> Floats:
             return self._density(fused.density(self._features(p)), p)
 
         return density_emission if emission else density
 
-    def _answer(self, fused: FusedNetwork, p: Any, d: Any) -> tuple[Any, list[Any]]:
+    def _answer(self, fused: FusedNetwork, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         config = self.config
         direction = config.direction.features(d) if config.network.view_dependent else None
         density, color = fused(self._features(p), direction)
         return self._density(density, p), self._color(color)
 
-    def _trunk(self, p: Any) -> Any:
+    def _trunk(self, p: Vectors) -> Tensor:
         with stage("encoding"):
             position = settled(stack_rows(self._features(p)))
         return network.trunk(self.config.network, self._weights, position)
 
-    def _features(self, p: Any) -> list[Any]:
+    def _features(self, p: Vectors) -> list[Floats]:
         config = self.config
         unit = vector3_type(type(p[0]))(
             *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
@@ -192,12 +218,12 @@ class NeuralField:
             features += self._grid.features(unit, self._weights[network.GRID])
         return features
 
-    def _color(self, raw: list[Any]) -> list[Any]:
+    def _color(self, raw: list[Floats]) -> list[Floats]:
         return [apply_activation(self.config.color_activation, c) for c in raw]
 
-    def _density(self, raw: Any, p: Any) -> Any:
+    def _density(self, raw: Floats, p: Vectors) -> Floats:
         config = self.config
         raw = raw + config.density_shift
-        if self.noise is not None:
-            raw = raw + self.noise.at(p)
+        if self._noise is not None:
+            raw = raw + self._noise.at(p)
         return apply_activation(config.density_activation, raw) * config.density_scale

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
+
+from ..base.arrays import Floats, Indices, Vectors
 
 
 @dataclass(frozen=True)
@@ -15,7 +16,7 @@ class DensityNoise:
     level: float  # standard deviation
     seed: int
 
-    def at(self, p: Any) -> Any:
+    def at(self, p: Vectors) -> Floats:
         """One value for each of N positions in single precision (Box & Muller 1958)."""
         float_type = type(p[0])
         uint = dr.uint32_array_t(float_type)
@@ -30,7 +31,7 @@ class DensityNoise:
         return dr.opaque(float_type, self.level) * radius * dr.cos(2 * dr.pi * second)
 
 
-def _scramble(x: Any) -> Any:
+def _scramble(x: Indices) -> Indices:
     """A hash of 32 bits (the output function of PCG, O'Neill 2014)."""
     x = x * 747796405 + 2891336453
     x = ((x >> ((x >> 28) + 4)) ^ x) * 277803737

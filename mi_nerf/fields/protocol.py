@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Protocol, runtime_checkable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
 
+from ..base.arrays import Floats, Vectors
 from ..base.box import Corner
 from ..base.color import ColorSpace
 from ..cameras.ndc import Ndc
 
 
-@runtime_checkable
-class Field(Protocol):
+class Field(ABC):
     """What quadrature, plugins and training need of any radiance field.
 
     Positions are 3-vectors in the field's own coordinates (scene units), directions
@@ -24,13 +25,24 @@ class Field(Protocol):
     lower: Corner  # corners of the box outside which the field is empty
     upper: Corner
     color_space: ColorSpace  # in which emission is expressed and composited
-    ndc: Ndc | None  # the projection in whose space the field lives; None: scene space
+    ndc: Ndc | None = None  # the projection in whose space the field lives; None: scene space
+    coarse: Field | None = None  # says where this one is worth sampling (NeRF Sec. 5.2)
 
-    def density(self, p: Any) -> Any:
+    @abstractmethod
+    def density(self, p: Vectors) -> Floats:
         """σ ≥ 0 at N points, in 1/scene unit."""
 
-    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+    @abstractmethod
+    def density_emission(self, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         """σ and the three channels of the emitted colour at N points along ``d``."""
 
+    @abstractmethod
     def parameters(self) -> Mapping[str, Any]:
         """Differentiable parameters by name; tensors that may be updated in place."""
+
+    def fused(self, emission: bool = True) -> Callable[..., Any] | None:
+        """:meth:`density_emission` of the parameters as they are, as one kernel without gradients.
+
+        Without ``emission``, :meth:`density`. ``None`` where there is no faster way.
+        """
+        return None

@@ -112,9 +112,9 @@ class FieldFile:
 
     def build(self, backend: Any) -> tuple[NeuralField, OccupancyGrid | None]:
         """Uploads the field to a backend (``drjit.llvm.ad``, or ``mitsuba`` with a variant)."""
-        neural = NeuralField(self.config, self.weights, backend.TensorXf)
-        if self.coarse is not None:
-            neural.coarse = NeuralField(self.config, self.coarse, backend.TensorXf)
+        tensors = backend.TensorXf
+        coarse = None if self.coarse is None else NeuralField(self.config, self.coarse, tensors)
+        neural = NeuralField(self.config, self.weights, tensors, coarse)
         if self.occupancy is None:
             return neural, None
         grid = OccupancyGrid(neural.lower, neural.upper, self.occupancy, backend.Float)

@@ -156,6 +156,11 @@ class _Parts:
     view: list[_Linear]
     color: _Linear
 
+    def layers(self) -> list[_Linear]:
+        """All of them, in the order of :meth:`NetworkConfig.layers`."""
+        feature = [] if self.feature is None else [self.feature]
+        return [*self.trunk, self.density, *feature, *self.view, self.color]
+
 
 @dataclass(frozen=True)
 class _Layout:
@@ -319,60 +324,42 @@ def _find(checkpoint: Checkpoint, wanted: Which | None) -> tuple[_Layout, str]:
 
 def _assemble(tensors: _Tensors, parts: _Parts, layout: _Layout) -> tuple[NetworkConfig, Arrays]:
     """The shape of the network, and its weights by the names of mi_nerf."""
-    width = parts.trunk[0].outputs
-    skip, weights = _trunk(tensors, parts.trunk, layout.position_first)
-    _put(weights, "density", _sized(tensors, parts.density, 1, width))
-    if parts.feature is not None:
-        _put(weights, "feature", _sized(tensors, parts.feature, width, width))
-    size, seen = width, 0
-    for i, layer in enumerate(parts.view):
-        if i == 0:
-            seen = layer.inputs - width
-            size = width + max(seen, 0)
-        _put(weights, f"view_{i}", _sized(tensors, layer, parts.view[0].outputs, size))
-        size = layer.outputs
-    if seen > 0:  # after the feature, in both codes
-        both = weights["view_0.weight"]
-        weights["view_0.weight"] = both[:, :width]
-        weights["view_0.direction_weight"] = both[:, width:]
-    _put(weights, "color", _sized(tensors, parts.color, 3, size))
+    position, width = parts.trunk[0].inputs, parts.trunk[0].outputs
+    seen = max(parts.view[0].inputs - width, 0) if parts.view else 0
     network = NetworkConfig(
         depth=len(parts.trunk),
         width=width,
-        skip=skip,
+        skip=_skip(tensors, parts.trunk),
         feature_layer=parts.feature is not None,
         feature_relu=parts.feature is not None and layout.feature_relu,
         view_depth=len(parts.view),
         view_width=parts.view[0].outputs if parts.view else 1,
         view_dependent=seen > 0,
     )
+    shapes, weights = network.shapes(position, seen), {}
+    for layer, linear in zip(network.layers(), parts.layers(), strict=True):
+        names = list(layer.matrices())
+        _sized(tensors, linear, layer.outputs, sum(shapes[name][1] for name in names))
+        if layer.sees == "position" and layout.position_first:
+            names.reverse()
+        start = 0
+        for name in names:
+            weights[name] = linear.weight[:, start : start + shapes[name][1]]
+            start += shapes[name][1]
+        weights[layer.bias] = linear.bias
     return network, {name: array.astype(np.float32) for name, array in weights.items()}
 
 
-def _trunk(tensors: _Tensors, layers: list[_Linear], position_first: bool) -> tuple[int, Arrays]:
-    """The skip layer, −1 for none, and the weights of the trunk."""
-    position, width = layers[0].inputs, layers[0].outputs
-    weights: Arrays = {}
-    skips = [i for i, layer in enumerate(layers) if i and layer.inputs == width + position]
+def _skip(tensors: _Tensors, trunk: list[_Linear]) -> int:
+    """The layer that sees the position again, −1 for none."""
+    both = trunk[0].outputs + trunk[0].inputs
+    skips = [i for i, layer in enumerate(trunk) if i and layer.inputs == both]
     if len(skips) > 1:
         raise InputError(
-            f"{tensors.where}: '{layers[skips[0]].name}' and '{layers[skips[1]].name}' both see "
+            f"{tensors.where}: '{trunk[skips[0]].name}' and '{trunk[skips[1]].name}' both see "
             "the position again, expected one such layer at most"
         )
-    for i, layer in enumerate(layers):
-        inputs = position if i == 0 else width + position * (i in skips)
-        _put(weights, f"trunk_{i}", _sized(tensors, layer, width, inputs))
-        if i in skips:
-            cut = position if position_first else width
-            left, right = layer.weight[:, :cut], layer.weight[:, cut:]
-            seen, before = (left, right) if position_first else (right, left)
-            weights[f"trunk_{i}.weight"] = before
-            weights[f"trunk_{i}.position_weight"] = seen
-    return (skips[0] if skips else -1), weights
-
-
-def _put(weights: Arrays, name: str, layer: _Linear) -> None:
-    weights[f"{name}.weight"], weights[f"{name}.bias"] = layer.weight, layer.bias
+    return skips[0] if skips else -1
 
 
 def _sized(tensors: _Tensors, layer: _Linear, outputs: int, inputs: int) -> _Linear:

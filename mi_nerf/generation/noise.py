@@ -15,13 +15,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
+from ..base.arrays import Image
 from ..images.write import on_white
-
-Image = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,8 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..base.arrays import upload
+from ..base.arrays import Image, upload
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
-
-Image = np.ndarray[Any, Any]
 
 _STEP = 1e-4  # past a surface, relative to the distance from the origin
 _NEAR_QUANTILE, _FAR_QUANTILE = 0.001, 0.999

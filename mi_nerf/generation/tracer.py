@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from ..base.arrays import Image
 from ..base.errors import InputError
 from ..cameras.pinhole import sensor_dict
 from ..cameras.poses import mitsuba_from_opengl
 from .plan import Plan, View
 from .surfaces import trace_surfaces
-
-Image = np.ndarray[Any, Any]
 
 # Samples that one call of mi.render traces at most: bounds its memory, and the time
 # until Ctrl-C is heard.

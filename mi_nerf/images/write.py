@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
 import OpenEXR
 
+from ..base.arrays import Image
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError
 from ..base.files import replacing
-
-Image = np.ndarray[Any, Any]
 
 _CHANNELS = {1: "Y", 3: "RGB", 4: "RGBA"}
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats, Indices
 from .strata import (
     stratified,
 )
@@ -20,8 +21,8 @@ _BELOW_ONE = 1 - 2.0**-24
 
 
 def inverse_transform(
-    t_near: Any, t_far: Any, weights: Any, bins: int, samples: int, jitter: Any = None
-) -> Any:
+    t_near: Floats, t_far: Floats, weights: Floats, bins: int, samples: int, jitter: Floats = None
+) -> Floats:
     """Samples distributed as piecewise-constant weights over equal bins of every ray.
 
     Inverts the cumulative distribution c of the normalised weights at one point u of each
@@ -58,7 +59,7 @@ def inverse_transform(
     return dr.clip(dr.fma(place, far - near, near), near, far)
 
 
-def merge_sorted(a: Any, b: Any, count_a: int, count_b: int) -> Any:
+def merge_sorted(a: Floats, b: Floats, count_a: int, count_b: int) -> Floats:
     """Merges two ascending rows of every ray into one ascending row of A + B values.
 
     Args:
@@ -82,11 +83,11 @@ def merge_sorted(a: Any, b: Any, count_a: int, count_b: int) -> Any:
     return merged
 
 
-def count_below(row: Any, value: Any, first: Any, count: int, strict: bool) -> Any:
+def count_below(row: Indices, value: Floats, first: Indices, count: int, strict: bool) -> Indices:
     """How many of ``row[first … first + count]`` lie below (or at) ``value``."""
     float_type = type(row)
 
-    def below(i: Any) -> Any:
+    def below(i: Any) -> Indices:
         entry = dr.gather(float_type, row, first + dr.fmin(i, count - 1))
         return entry < value if strict else entry <= value
 

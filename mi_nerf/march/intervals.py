@@ -7,11 +7,12 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats, Mask, Vectors
 from ..cameras.ndc import NdcRays
 from ..fields.protocol import Field
 
 
-def box_interval(o: Any, d: Any, lower: Any, upper: Any) -> tuple[Any, Any, Any]:
+def box_interval(o: Vectors, d: Vectors, lower: Any, upper: Any) -> tuple[Floats, Floats, Mask]:
     """Intersects rays with an axis-aligned box (slab method, Kay & Kajiya 1986).
 
     Args:
@@ -40,8 +41,8 @@ def box_interval(o: Any, d: Any, lower: Any, upper: Any) -> tuple[Any, Any, Any]
 
 
 def clip_interval(
-    t_near: Any, t_far: Any, hit: Any, near: Any = None, far: Any = None
-) -> tuple[Any, Any, Any]:
+    t_near: Floats, t_far: Floats, hit: Mask, near: Any = None, far: Any = None
+) -> tuple[Floats, Floats, Mask]:
     """Shortens intervals to the bounds ``near`` and ``far``: numbers, arrays or ``None``."""
     float_type = type(t_near)
     if near is not None:
@@ -52,7 +53,7 @@ def clip_interval(
     return dr.select(hit, t_near, 0), dr.select(hit, t_far, 0), hit
 
 
-def _as_data(float_type: Any, value: Any) -> Any:
+def _as_data(float_type: Any, value: Any) -> Floats:
     """A number as an array that kernels do not take for a constant."""
     return dr.opaque(float_type, float(value)) if isinstance(value, int | float) else value
 
@@ -61,16 +62,16 @@ def _as_data(float_type: Any, value: Any) -> Any:
 class RaySegments:
     """The parts of R rays o + t·d in which a field lies: near ≤ t ≤ far."""
 
-    o: Any  # R origins, in the space where the field lives
-    d: Any  # R unit directions in that space
-    view: Any  # R unit directions in scene space, along which the field emits
-    near: Any  # R bounds of t; both 0 where the field is missed
-    far: Any
-    hit: Any  # whether there is anything between them
+    o: Vectors  # R origins, in the space where the field lives
+    d: Vectors  # R unit directions in that space
+    view: Vectors  # R unit directions in scene space, along which the field emits
+    near: Floats  # R bounds of t; both 0 where the field is missed
+    far: Floats
+    hit: Mask  # whether there is anything between them
     ndc: NdcRays | None  # how o, d and t came about, where that is not scene space
 
 
-def ray_segments(field: Field, o: Any, d: Any, *limits: tuple[Any, Any]) -> RaySegments:
+def ray_segments(field: Field, o: Vectors, d: Vectors, *limits: tuple[Any, Any]) -> RaySegments:
     """Where the rays ``o + t·d`` (unit ``d``) are inside the field's box.
 
     Rays are projected first where the field asks for it (NeRF, appendix C); those that do

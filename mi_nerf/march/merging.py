@@ -20,6 +20,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats, Indices
 from .importance import count_below
 from .query import Evaluation
 from .rules import sample_weights
@@ -33,11 +34,11 @@ _NONE = 0xFFFFFFFF
 class Layer:
     """The samples of one field on the rays that cross its box."""
 
-    ray: Any  # N numbers of rays, each once
+    ray: Indices  # N numbers of rays, each once
     samples: Samples  # theirs
     evaluation: Evaluation
     scale: Any  # N lengths in the field's own units of a unit length of the scene
-    edges: Any  # N·(S + 1) ends of the samples' intervals, as distances in the scene
+    edges: Floats  # N·(S + 1) ends of the samples' intervals, as distances in the scene
 
     @property
     def stride(self) -> int:
@@ -49,8 +50,8 @@ class Layer:
 class Pieces:
     """R·W pieces of R rays, ascending, on which all densities are constant."""
 
-    t: Any  # R·W distances at which they begin
-    delta: Any  # R·W lengths; 0 for those that fill up a row
+    t: Floats  # R·W distances at which they begin
+    delta: Floats  # R·W lengths; 0 for those that fill up a row
     width: int  # W
     sample: list[Any]  # for each field, R·W numbers of the samples that they belong to
 
@@ -61,8 +62,8 @@ class MergedView:
 
     color: list[list[Any]]  # of each field, three arrays of R values: weights times emission
     share: list[Any]  # of each field, R opacities: they sum to that of all
-    opacity: Any  # R values
-    depth: Any  # R mean distances under the weights, scene units; 0 where nothing is seen
+    opacity: Floats  # R values
+    depth: Floats  # R mean distances under the weights, scene units; 0 where nothing is seen
     weights: list[Any]  # of each field, R·W weights of the pieces
 
 
@@ -170,11 +171,11 @@ class _Ends:
         dr.scatter(self.row, dr.arange(uint, len(layer.ray)), layer.ray)
         dr.eval(self.rank, self._kept, self.list, self.row, self.asked)
 
-    def kept_of(self, row: Any) -> Any:
+    def kept_of(self, row: Indices) -> Any:
         """How many ends in a row matter."""
         return dr.gather(self._uint, self._kept, row, row != _NONE)
 
-    def locate(self, ray: Any, x: Any, strict: bool) -> tuple[Any, Any]:
+    def locate(self, ray: Indices, x: Floats, strict: bool) -> tuple[Any, Any]:
         """The row of a ray, and how many of its ends lie below (or at) x."""
         row = dr.gather(self._uint, self.row, ray)
         there = row != _NONE
@@ -182,13 +183,13 @@ class _Ends:
         count = count_below(self._edges, x, first, self._stride, strict)
         return row, dr.select(there, count, 0)
 
-    def kept_below(self, row: Any, count: Any) -> Any:
+    def kept_below(self, row: Indices, count: Indices) -> Any:
         """How many of the first ``count`` ends of a row matter."""
         whole = count == self._stride
         rank = dr.gather(self._uint, self.rank, row * self._stride + count, (row != _NONE) & ~whole)
         return dr.select(whole, self.kept_of(row), rank)
 
-    def sample(self, row: Any, count: Any) -> Any:
+    def sample(self, row: Indices, count: Indices) -> Any:
         """The sample that begins with the last of the first ``count`` ends, if it was asked."""
         inside = (row != _NONE) & (count > 0) & (count < self._stride)
         number = row * (self._stride - 1) + count - 1
@@ -196,7 +197,7 @@ class _Ends:
         return dr.select(asked, number, _NONE)
 
 
-def _lengths(t: Any, total: Any, width: int) -> Any:
+def _lengths(t: Floats, total: Floats, width: int) -> Floats:
     """From each end to the next; 0 after the last of a ray."""
     uint, float_type = type(total), type(t)
     index = dr.arange(uint, len(t))

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
+from ..base.arrays import Floats, Indices
 from ..fields.protocol import Field
 from .samples import Samples
 from .strata import points_along
 
 
-def density_gradient(field: Field, samples: Samples, index: Any, block: int) -> list[Any]:
+def density_gradient(field: Field, samples: Samples, index: Indices, block: int) -> list[Floats]:
     """∇σ at the samples ``index``, zero at the others: three arrays of R·S values.
 
     In the space where the field lives, 1/unit². It carries no gradient itself, and leaves

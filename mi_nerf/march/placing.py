@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats, Mask, Vectors
 from .importance import inverse_transform, merge_sorted
 from .intervals import ray_segments
 from .marched import MarchedField
@@ -19,10 +20,10 @@ from .strata import cell_widths, points_along
 
 def place_samples(
     marched: MarchedField,
-    o: Any,
-    d: Any,
+    o: Vectors,
+    d: Vectors,
     *,
-    jitter: Any = None,
+    jitter: Floats = None,
     bounds: tuple[Any, Any] | None = None,
 ) -> Samples:
     """Stratified samples of the rays ``o + t·d`` (unit ``d``) inside the field's box.
@@ -39,10 +40,9 @@ def place_samples(
         t, delta = rule.place(near, far, count, jitter)
         samples = Samples(o, d, within.view, t, delta, count, near, far, ndc=within.ndc, rule=rule)
         samples = _select(samples, within.hit, occupancy, settings.hidden)
-        coarse = getattr(field, "coarse", None)
-        if coarse is None or not settings.fine:
+        if field.coarse is None or not settings.fine:
             return samples
-        evaluation = Evaluation(coarse, samples, settings.block, stop=settings.stop)
+        evaluation = Evaluation(field.coarse, samples, settings.block, stop=settings.stop)
         weights, _ = sample_weights(evaluation.density, delta, settings.samples)
         shift = jitter if jitter is not None and len(jitter) == samples.rays else None
         samples.index = evaluation.asked
@@ -51,10 +51,10 @@ def place_samples(
 
 def refine(
     samples: Samples,
-    weights: Any,
+    weights: Floats,
     fine: int,
     occupancy: OccupancyGrid | None = None,
-    jitter: Any = None,
+    jitter: Floats = None,
     hidden: float = 0.0,
 ) -> Samples:
     """Adds ``fine`` samples a ray where ``weights`` are large (NeRF Sec. 5.2).
@@ -82,7 +82,7 @@ def refine(
         return _select(merged, far > near, occupancy, hidden)
 
 
-def _select(samples: Samples, hit: Any, occupancy: OccupancyGrid | None, hidden: float) -> Samples:
+def _select(samples: Samples, hit: Mask, occupancy: OccupancyGrid | None, hidden: float) -> Samples:
     """Keeps for evaluation the samples that may lie in something, and may be seen."""
     dr.eval(samples.t, samples.delta, samples.near, samples.far)
     t = samples.t

@@ -12,6 +12,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats
 from .query import Evaluation
 from .rules import RULES, CellRule
 from .samples import Samples
@@ -21,10 +22,10 @@ from .samples import Samples
 class Composite:
     """What R rays see of a medium."""
 
-    color: list[Any]  # R values a channel: emission weighted along the ray, no background
-    opacity: Any  # R values in [0, 1]: 1 − transmittance of the whole ray
-    depth: Any  # R values: mean t under the weights; 0 where the opacity is 0
-    weights: Any  # R·S values: the share of each sample, summing to the opacity
+    color: list[Floats]  # R values a channel: emission weighted along the ray, no background
+    opacity: Floats  # R values in [0, 1]: 1 − transmittance of the whole ray
+    depth: Floats  # R values: mean t under the weights; 0 where the opacity is 0
+    weights: Floats  # R·S values: the share of each sample, summing to the opacity
 
 
 def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
@@ -49,10 +50,10 @@ def integrate(evaluation: Evaluation, samples: Samples) -> Composite:
 
 
 def composite(
-    density: Any,
+    density: Floats,
     emission: list[Any],
-    t: Any,
-    delta: Any,
+    t: Floats,
+    delta: Floats,
     samples: int,
     rule: CellRule = RULES["constant"],
     bounds: tuple[Any, Any] = (None, None),
@@ -75,6 +76,6 @@ def composite(
     return Composite(color, opacity, dr.select(visible, mean_t, 0), weights)
 
 
-def over_background(color: list[Any], opacity: Any, background: list[Any]) -> list[Any]:
+def over_background(color: list[Floats], opacity: Floats, background: list[Floats]) -> list[Floats]:
     """Places what the rays saw in front of ``background`` (one value or array a channel)."""
     return [c + (1 - opacity) * b for c, b in zip(color, background, strict=True)]

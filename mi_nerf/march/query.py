@@ -9,7 +9,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..base.arrays import gather_vector3
+from ..base.arrays import Floats, Indices, Mask, gather_vector3
 from ..base.kernel_stages import stage
 from ..fields.protocol import Field
 from .samples import Samples
@@ -59,8 +59,7 @@ class Evaluation:
         self._field, self._samples, self._block = field, samples, block
         self._graph: list[tuple[Any, Any, list[Any]]] = []
         self._tail = tail or (block // 4 if stop > 0 and block >= 4096 else block)
-        fused = getattr(field, "fused", None)
-        self._fused = fused(emission) if fused is not None and not keep else None
+        self._fused = None if keep else field.fused(emission)
         self._emits = emission
         float_type = type(samples.t)
         self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4 if emission else 1)]
@@ -72,7 +71,7 @@ class Evaluation:
         rounds = [self._evaluate(index, keep) for index in self._front_to_back(stop)]
         self.asked = _joined(rounds, type(samples.index))
 
-    def _evaluate(self, index: Any, keep: bool) -> Any:
+    def _evaluate(self, index: Indices, keep: bool) -> Indices:
         """Fills in the samples ``index``, and returns it."""
         size = max(len(index), 1) if self._fused else self._block  # only tensors have shapes
         for where, valid in self._blocks(index, size):
@@ -88,7 +87,7 @@ class Evaluation:
                 dr.eval(self._channels, outputs)
         return index
 
-    def _front_to_back(self, stop: float) -> Iterator[Any]:
+    def _front_to_back(self, stop: float) -> Iterator[Indices]:
         """Indices of the samples to ask for next, as long as any ray goes on.
 
         Each round looks at a few more samples of every ray that goes on, and at more of them
@@ -128,12 +127,12 @@ class Evaluation:
         return size
 
     @property
-    def density(self) -> Any:
+    def density(self) -> Floats:
         """R·S densities, 1/scene unit."""
         return self._channels[0]
 
     @property
-    def emission(self) -> list[Any]:
+    def emission(self) -> list[Floats]:
         """Three arrays of R·S colours, or none if not wanted."""
         return self._channels[1:]
 
@@ -183,7 +182,7 @@ class Evaluation:
         for channel, tangent in zip(self._channels, tangents, strict=True):
             dr.set_grad(channel, tangent)
 
-    def _blocks(self, index: Any, block: int) -> Iterator[tuple[Any, Any]]:
+    def _blocks(self, index: Indices, block: int) -> Iterator[tuple[Indices, Mask]]:
         """Sample numbers and validity of each block; the last one is padded."""
         uint = type(index)
         for start, size in self._ranges(len(index), block):
@@ -203,7 +202,7 @@ class Evaluation:
             yield start, size
             start += size
 
-    def _query(self, where: Any, fused: Any = None) -> list[Any]:
+    def _query(self, where: Indices, fused: Any = None) -> list[Floats]:
         samples = self._samples
         ray = where // samples.count
         t = dr.gather(type(samples.t), samples.t, where)
@@ -241,7 +240,7 @@ def _joined(parts: list[Any], uint: Any) -> Any:
     return total
 
 
-def _spans(ray: Any, rays: int) -> tuple[Any, Any]:
+def _spans(ray: Indices, rays: int) -> tuple[Indices, Indices]:
     """Where the entries of each of the rays begin among ascending ray numbers, and how many."""
     uint, last = type(ray), dr.opaque(type(ray), len(ray) - 1)
     place = dr.arange(uint, len(ray))

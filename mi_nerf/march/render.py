@@ -18,7 +18,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..base.arrays import gather_vector3
+from ..base.arrays import Floats, Vectors, gather_vector3
 from .marched import MarchedField
 from .placing import place_samples
 from .quadrature import integrate
@@ -30,9 +30,9 @@ from .settings import MarchSettings
 class RayImage:
     """What R rays see, without background, in the field's colour space."""
 
-    color: list[Any]  # three arrays of R values, premultiplied by the opacity
-    opacity: Any
-    depth: Any  # distance along the unit ray, scene units; 0 where nothing is seen
+    color: list[Floats]  # three arrays of R values, premultiplied by the opacity
+    opacity: Floats
+    depth: Floats  # distance along the unit ray, scene units; 0 where nothing is seen
     queries: int  # how often its networks were asked
 
 
@@ -43,7 +43,9 @@ def ray_chunks(rays: int, settings: MarchSettings) -> Iterator[tuple[int, int]]:
         yield start, min(size, rays - start)
 
 
-def render_rays(marched: MarchedField, o: Any, d: Any, *, jitter: Any = None) -> RayImage:
+def render_rays(
+    marched: MarchedField, o: Vectors, d: Vectors, *, jitter: Floats = None
+) -> RayImage:
     """Renders R rays without derivatives, in chunks of bounded memory.
 
     Args:
@@ -69,7 +71,9 @@ def render_rays(marched: MarchedField, o: Any, d: Any, *, jitter: Any = None) ->
     return RayImage(outputs[:3], outputs[3], outputs[4], queries)
 
 
-def slice_rays(o: Any, d: Any, jitter: Any, start: int, size: int) -> tuple[Any, Any, Any, Any]:
+def slice_rays(
+    o: Vectors, d: Vectors, jitter: Floats, start: int, size: int
+) -> tuple[Any, Any, Any, Any]:
     """Rays ``start … start + size`` of a batch, with their indices and jitter."""
     float_type = type(o[0])
     uint = dr.uint32_array_t(float_type)

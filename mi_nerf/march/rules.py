@@ -24,6 +24,7 @@ from typing import Any, Literal
 
 import drjit as dr
 
+from ..base.arrays import Floats
 from .strata import (
     cell_edges,
     cell_widths,
@@ -53,17 +54,17 @@ class CellRule:
         """The rule of samples that are no longer one in each of equal strata."""
         return self
 
-    def place(self, near: Any, far: Any, samples: int, jitter: Any) -> tuple[Any, Any]:
+    def place(self, near: Floats, far: Floats, samples: int, jitter: Floats) -> tuple[Any, Any]:
         """Samples and widths of R rays; arguments as for :func:`.strata.stratified`."""
         t, _ = stratified(near, far, samples, jitter)
         return t, cell_widths(t, near, far, samples)
 
-    def edges(self, t: Any, near: Any, far: Any, samples: int) -> Any:
+    def edges(self, t: Floats, near: Floats, far: Floats, samples: int) -> Floats:
         """R·(S + 1) ascending ends of the intervals: sample s lies between s and s + 1."""
         return cell_edges(t, near, far, samples)
 
     def weights(
-        self, density: Any, t: Any, delta: Any, bounds: tuple[Any, Any], samples: int
+        self, density: Floats, t: Floats, delta: Floats, bounds: tuple[Any, Any], samples: int
     ) -> tuple[Any, Any]:
         """Weights (R·S) and opacities (R) of densities at samples ``t`` of widths ``delta``."""
         return sample_weights(density, delta, samples)
@@ -78,10 +79,10 @@ class StratumRule(CellRule):
     def refined(self) -> CellRule:
         return RULES["cells"]
 
-    def place(self, near: Any, far: Any, samples: int, jitter: Any) -> tuple[Any, Any]:
+    def place(self, near: Floats, far: Floats, samples: int, jitter: Floats) -> tuple[Any, Any]:
         return stratified(near, far, samples, jitter)
 
-    def edges(self, t: Any, near: Any, far: Any, samples: int) -> Any:
+    def edges(self, t: Floats, near: Floats, far: Floats, samples: int) -> Floats:
         return stratum_edges(near, far, samples)
 
 
@@ -92,7 +93,7 @@ class LinearRule(CellRule):
     reads_bounds = True
 
     def weights(
-        self, density: Any, t: Any, delta: Any, bounds: tuple[Any, Any], samples: int
+        self, density: Floats, t: Floats, delta: Floats, bounds: tuple[Any, Any], samples: int
     ) -> tuple[Any, Any]:
         return linear_weights(density, t, *bounds, samples)
 
@@ -102,21 +103,21 @@ RULES: dict[Rule, CellRule] = {
 }
 
 
-def one_minus_exp(x: Any) -> Any:
+def one_minus_exp(x: Floats) -> Floats:
     """1 − exp(−x) for x ≥ 0, accurate to a few ulp where the formula itself cancels."""
     small = x < 0.25
     y = dr.select(small, x, 0)
     return dr.select(small, y * _mean_series(y), 1 - dr.exp(-dr.select(small, 1, x)))
 
 
-def mean_transmittance(x: Any) -> Any:
+def mean_transmittance(x: Floats) -> Floats:
     """(1 − exp(−x))/x for x ≥ 0: the mean of exp(−ux) over 0 ≤ u ≤ 1."""
     small = x < 0.25
     y = dr.select(small, 1, x)
     return dr.select(small, _mean_series(dr.select(small, x, 0)), (1 - dr.exp(-y)) / y)
 
 
-def _mean_series(x: Any) -> Any:
+def _mean_series(x: Floats) -> Floats:
     """(1 − exp(−x))/x for 0 ≤ x ≤ 1/4, as 1 − x/2(1 − x/3(1 − …))."""
     factor = type(x)(1)
     for n in (8, 7, 6, 5, 4, 3, 2):
@@ -124,7 +125,7 @@ def _mean_series(x: Any) -> Any:
     return factor
 
 
-def sample_weights(density: Any, delta: Any, samples: int) -> tuple[Any, Any]:
+def sample_weights(density: Floats, delta: Floats, samples: int) -> tuple[Floats, Floats]:
     """Weights and opacities of the rules with constant density.
 
     Args:
@@ -141,7 +142,9 @@ def sample_weights(density: Any, delta: Any, samples: int) -> tuple[Any, Any]:
     return weights, one_minus_exp(dr.block_sum(tau, samples))
 
 
-def linear_weights(density: Any, t: Any, near: Any, far: Any, samples: int) -> tuple[Any, Any]:
+def linear_weights(
+    density: Floats, t: Floats, near: Floats, far: Floats, samples: int
+) -> tuple[Floats, Floats]:
     """Weights and opacities of the rule with linear density.
 
     Density is linear between samples and constant between the outer ones and the ends.
@@ -177,6 +180,6 @@ def linear_weights(density: Any, t: Any, near: Any, far: Any, samples: int) -> t
     return weights, one_minus_exp(dr.block_sum(tau, samples))
 
 
-def _opaque_at_most(tau: Any) -> Any:
+def _opaque_at_most(tau: Floats) -> Floats:
     """Limits optical depths; lets NaN through."""
     return dr.select(tau > MAX_OPTICAL_DEPTH, MAX_OPTICAL_DEPTH, tau)

@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats, Indices, Vectors
 from ..cameras.ndc import NdcRays
 from .rules import RULES, CellRule
 
@@ -20,15 +21,15 @@ class Samples:
     of a short interval's length would survive their subtraction.
     """
 
-    o: Any  # R origins, in the space where the field lives
-    d: Any  # R unit directions in that space
-    view: Any  # R unit directions in scene space, along which the field emits
-    t: Any  # R·S sample parameters
-    delta: Any  # R·S interval lengths
+    o: Vectors  # R origins, in the space where the field lives
+    d: Vectors  # R unit directions in that space
+    view: Vectors  # R unit directions in scene space, along which the field emits
+    t: Floats  # R·S sample parameters
+    delta: Floats  # R·S interval lengths
     count: int  # S
-    near: Any  # R bounds of t
-    far: Any
-    index: Any = None  # the M samples to evaluate, ascending
+    near: Floats  # R bounds of t
+    far: Floats
+    index: Indices = None  # the M samples to evaluate, ascending
     coarse_queries: int = 0  # of the coarse network, by which the samples were placed
     ndc: NdcRays | None = None  # how o, d and t came about, where that is not scene space
     rule: CellRule = RULES["constant"]  # of quadrature
@@ -43,7 +44,7 @@ class Samples:
         """M."""
         return len(self.index)
 
-    def edges(self) -> Any:
+    def edges(self) -> Floats:
         """R·(S + 1) ascending ends of the intervals: sample s lies between s and s + 1."""
         return self.rule.edges(self.t, self.near, self.far, self.count)
 

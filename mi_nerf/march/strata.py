@@ -7,14 +7,14 @@ their directions first, as :func:`mi_nerf.cameras.pinhole` does.
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 
-from ..base.arrays import vector3_type
+from ..base.arrays import Floats, Indices, Vectors, vector3_type
 
 
-def stratified(t_near: Any, t_far: Any, samples: int, jitter: Any = None) -> tuple[Any, Any]:
+def stratified(
+    t_near: Floats, t_far: Floats, samples: int, jitter: Floats = None
+) -> tuple[Floats, Floats]:
     """One sample in each of ``samples`` equal strata of every ray (NeRF Eq. 2).
 
     Args:
@@ -45,7 +45,7 @@ def stratified(t_near: Any, t_far: Any, samples: int, jitter: Any = None) -> tup
     return dr.fma(stratum + offset, delta, start), delta
 
 
-def points_along(o: Any, d: Any, t: Any, ray: Any) -> Any:
+def points_along(o: Vectors, d: Vectors, t: Floats, ray: Indices) -> Vectors:
     """o + t·d for samples that belong to the rays ``ray``."""
     float_type = type(t)
     return vector3_type(float_type)(
@@ -56,7 +56,7 @@ def points_along(o: Any, d: Any, t: Any, ray: Any) -> Any:
     )
 
 
-def stratum_edges(t_near: Any, t_far: Any, samples: int) -> Any:
+def stratum_edges(t_near: Floats, t_far: Floats, samples: int) -> Floats:
     """The ends of equal strata: R·(S + 1) ascending parameters, of S strata a ray."""
     float_type = type(t_near)
     uint = dr.uint32_array_t(float_type)
@@ -67,7 +67,7 @@ def stratum_edges(t_near: Any, t_far: Any, samples: int) -> Any:
     return dr.select(share < 1, dr.fmin(dr.fma(share, far - near, near), far), far)
 
 
-def cell_edges(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
+def cell_edges(t: Floats, t_near: Floats, t_far: Floats, samples: int) -> Floats:
     """The ends of what belongs to each sample, see :func:`cell_widths`.
 
     Args:
@@ -90,7 +90,7 @@ def cell_edges(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
     return dr.select(within == 0, near, dr.select(within == samples, far, middle))
 
 
-def cell_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
+def cell_widths(t: Floats, t_near: Floats, t_far: Floats, samples: int) -> Floats:
     """The part of each ray that belongs to each sample: up to halfway to its neighbours.
 
     Args:
@@ -105,7 +105,7 @@ def cell_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> Any:
     return below + above
 
 
-def half_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> tuple[Any, Any]:
+def half_widths(t: Floats, t_near: Floats, t_far: Floats, samples: int) -> tuple[Floats, Floats]:
     """The parts of a sample's cell before and behind the sample; see :func:`cell_widths`."""
     float_type = type(t)
     index = dr.arange(dr.uint32_array_t(float_type), len(t))
@@ -118,7 +118,9 @@ def half_widths(t: Any, t_near: Any, t_far: Any, samples: int) -> tuple[Any, Any
     return below, dr.select(within < samples - 1, 0.5 * (after - t), to_far)
 
 
-def neighbours(x: Any, samples: int, *, first: Any = None, last: Any = None) -> tuple[Any, Any]:
+def neighbours(
+    x: Floats, samples: int, *, first: Floats = None, last: Floats = None
+) -> tuple[Floats, Floats]:
     """The values of the samples before and behind each one, of R·S.
 
     ``first`` and ``last`` (R·S values each) stand in where a ray begins and ends; by

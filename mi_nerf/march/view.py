@@ -9,13 +9,11 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import vector3_type
+from ..base.arrays import Image, vector3_type
 from ..base.color import linear_to_srgb
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from .marched import MarchedField
 from .render import render_rays
-
-Image = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)

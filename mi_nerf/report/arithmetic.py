@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
-from ..fields.network import GRID
 from ..fields.neural import NeuralFieldConfig
 
 _SHAPE = (256, 256, 16384)  # of the product that sets the limit: a wide layer, a full block
@@ -18,7 +18,7 @@ _REPETITIONS = 20
 
 def multiply_adds(config: NeuralFieldConfig) -> int:
     """Multiply-adds of the network's matrices for one query, forward."""
-    return sum(outputs * inputs for outputs, inputs in _matrices(config).values())
+    return sum(size for _, size in _matrices(config))
 
 
 def training_flop(config: NeuralFieldConfig) -> int:
@@ -28,17 +28,17 @@ def training_flop(config: NeuralFieldConfig) -> int:
     own gradient and that of its input, except where the input has none: features of a
     direction never have, those of a position only where a hash grid is among them.
     """
-    products = 0
-    for name, (outputs, inputs) in _matrices(config).items():
-        position = name == "trunk_0.weight" or name.endswith(".position_weight")
-        fixed = name.endswith(".direction_weight") or (position and config.grid is None)
-        products += (2 if fixed else 3) * outputs * inputs
+    fixed = ("direction", "position") if config.grid is None else ("direction",)
+    products = sum((2 if source in fixed else 3) * size for source, size in _matrices(config))
     return 2 * products
 
 
-def _matrices(config: NeuralFieldConfig) -> dict[str, tuple[int, int]]:
-    shapes = config.shapes().items()
-    return {n: (s[0], s[1]) for n, s in shapes if n != GRID and len(s) == 2}
+def _matrices(config: NeuralFieldConfig) -> Iterator[tuple[str, int]]:
+    """What each matrix of the network is multiplied with, and how many numbers it holds."""
+    shapes = config.shapes()
+    for layer in config.network.layers():
+        for name, source in layer.matrices().items():
+            yield source, math.prod(shapes[name])
 
 
 def drjit_product_rate(backend: Any) -> float:

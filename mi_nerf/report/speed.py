@@ -168,7 +168,7 @@ def sweep(
 def settings_of(subject: Subject, knobs: Knobs) -> dict[Setting, list[str]]:
     """All that a sweep tries, once each, and the knobs that lead there; the own ones first."""
     march = subject.marched.settings
-    both = march.fine > 0 and getattr(subject.field, "coarse", None) is not None
+    both = march.fine > 0 and subject.field.coarse is not None
     march = march if both else replace(march, fine=0)
     found: dict[Setting, list[str]] = {Setting(march): ["own"]}
 

@@ -21,8 +21,6 @@ from ..training.presets import preset
 from .evaluate import evaluate, quality, reference_image
 from .target import open_target
 
-Image = np.ndarray[Any, Any]
-
 SCENE = "arches"
 
 

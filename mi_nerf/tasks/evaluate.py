@@ -15,6 +15,7 @@ from typing import Any
 import imageio.v3 as iio
 import numpy as np
 
+from ..base.arrays import Image
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError, Option
 from ..base.files import make_folder, replacing
@@ -23,8 +24,6 @@ from ..data import Dataset, load_dataset
 from ..images.metrics import psnr, ssim, to_8bit
 from ..march.view import display_image, render_view
 from .target import Target
-
-Image = np.ndarray[Any, Any]
 
 
 def evaluate(

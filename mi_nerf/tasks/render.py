@@ -11,6 +11,7 @@ from typing import Any, Literal
 import imageio.v2 as imageio
 import numpy as np
 
+from ..base.arrays import Image
 from ..base.color import srgb_to_linear
 from ..base.errors import InputError, Option
 from ..base.files import check_file, check_folder, make_folder, replacing
@@ -23,7 +24,6 @@ from ..march.view import render_view
 from ..scene_xml.scene_file import load_scene
 from .target import Target, open_target
 
-Image = np.ndarray[Any, Any]
 Path_ = Literal["orbit", "spiral", "test"]
 Frames = Generator[tuple[str, Image], None, None]  # name and (H, W, 4) linear premultiplied RGBA
 

@@ -16,6 +16,7 @@ from ..base.arrays import vector3_type
 from ..base.progress_bar import progress_bar
 from ..data import Dataset
 from ..fields.neural import NeuralField
+from ..fields.protocol import Field
 from .batches import RaySource, step_rng
 from .config import TrainConfig
 from .schedule import learning_rate
@@ -173,10 +174,8 @@ class Probes:
         return _decibels(trainer.validate(pixels, _EvenLight(field, cameras)))
 
 
-class _EvenLight:
+class _EvenLight(Field):
     """A field whose emission is averaged over directions from which cameras see it."""
-
-    coarse = None
 
     def __init__(self, field: NeuralField, cameras: np.ndarray[Any, Any]) -> None:
         self._field, self._cameras = field, cameras

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .._version import __version__
+from ..base.arrays import Image
 from ..base.errors import InputError, Option
 from ..base.files import check_folder, make_folder, write_json
 from ..base.interrupts import interruptible
@@ -26,7 +27,7 @@ from ..data import Dataset, load_dataset
 from ..formats.field_file import FieldFile, save_field
 from ..march.marched import MarchedField
 from ..march.settings import MarchSettings
-from ..march.view import Image, View, display_image, render_view
+from ..march.view import View, display_image, render_view
 from .auto import Choice, Decision, choose
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .config import TrainConfig, to_json

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,7 +15,6 @@ from ..base.kernel_stages import stage
 from ..base.machine import available_memory
 from ..data import Dataset
 from ..fields.neural import NeuralField
-from ..fields.noise import DensityNoise
 from ..fields.protocol import Field
 from ..march.marched import MarchedField
 from ..march.occupancy import OccupancyGrid
@@ -151,13 +149,13 @@ class Trainer:
         """Fresh weights, moments and occupancy, from the seed and the attempt."""
         config = self.config
         seed = config.seed + 1000 * self.attempt
-        self.field = NeuralField.create(self.field_config, seed, self._backend.TensorXf)
-        groups = {"": self.field.parameters()}
+        tensors, coarse = self._backend.TensorXf, None
         if config.sampling.fine:
-            self.field.coarse = NeuralField.create(
-                self.field_config, seed + _COARSE_SEED, self._backend.TensorXf
-            )
-            groups["coarse."] = self.field.coarse.parameters()
+            coarse = NeuralField.create(self.field_config, seed + _COARSE_SEED, tensors)
+        self.field = NeuralField.create(self.field_config, seed, tensors, coarse)
+        groups = {"": self.field.parameters()}
+        if coarse is not None:
+            groups["coarse."] = coarse.parameters()
         self.parameters = JointParameters(groups)
         options = config.optimizer
         self.optimizer = Adam(
@@ -227,11 +225,11 @@ class Trainer:
     def _differentiate(self, drawn: _Drawn) -> _Part:
         """Sets the gradients of all parameters to those of the loss, part by part."""
         self.optimizer.zero_grad()
-        with self._networks_in_training():
-            parts = [
-                self._differentiate_part(drawn.part(start, size), size / drawn.rays)
-                for start, size in self._parts(drawn.rays)
-            ]
+        field = self._field_in_training()
+        parts = [
+            self._differentiate_part(field, drawn.part(start, size), size / drawn.rays)
+            for start, size in self._parts(drawn.rays)
+        ]
         return sum(parts[1:], parts[0])
 
     def _update(self, learning_rate: float, loss: Any) -> Any:
@@ -264,33 +262,23 @@ class Trainer:
         for start in range(0, rays, size):
             yield start, min(size, rays - start)
 
-    @contextmanager
-    def _networks_in_training(self) -> Iterator[None]:
+    def _field_in_training(self) -> NeuralField:
         """Noise on the densities of real captures (NeRF, appendix A), and half precision."""
-        networks = [f for f in (self.field, self.field.coarse) if f is not None]
-        for k, network in enumerate(networks):
-            if self.loss_scale is not None:
-                network.loss_scale = self.loss_scale.value
-            if self._noise_level > 0:
-                network.noise = DensityNoise(self._noise_level, 2 * self.step_count + k)
-        try:
-            yield
-        finally:
-            for network in networks:
-                network.noise = network.loss_scale = None
+        scale = None if self.loss_scale is None else self.loss_scale.value
+        return self.field.for_training(self._noise_level, 2 * self.step_count, scale)
 
-    def _differentiate_part(self, drawn: _Drawn, share: float) -> _Part:
+    def _differentiate_part(self, field: NeuralField, drawn: _Drawn, share: float) -> _Part:
         """Adds the gradients of the loss over ``share`` of the step's rays to the parameters'."""
         sampling, batch, march = self.config.sampling, drawn.batch, self.march_settings()
         budget = math.ceil(sampling.batch * share)
         with stage("samples"):
-            marched = MarchedField(self.field, march, self.occupancy)
+            marched = MarchedField(field, march, self.occupancy)
             samples = place_samples(marched, batch.o, batch.d, jitter=drawn.jitter)
         wanted = samples.queries
         complete = samples.truncate(budget)
         queries, passes = samples.queries, []
-        if self.field.coarse is not None:
-            coarse = self._evaluate(self.field.coarse, samples)
+        if field.coarse is not None:
+            coarse = self._evaluate(field.coarse, samples)
             with stage("compositing"):
                 passes.append((coarse, integrate(coarse, samples)))
             weights, fine, offsets = passes[0][1].weights, sampling.fine, drawn.fine_jitter
@@ -299,7 +287,7 @@ class Trainer:
             wanted += samples.queries
             complete = dr.minimum(complete, samples.truncate(max(1, budget - queries)))
             queries += samples.queries
-        evaluation = self._evaluate(self.field, samples)
+        evaluation = self._evaluate(field, samples)
         with stage("compositing"):
             passes.append((evaluation, integrate(evaluation, samples)))
             errors = [self._errors(batch, seen, complete, share) for _, seen in passes]

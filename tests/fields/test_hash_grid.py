@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import drjit as dr
@@ -125,6 +127,44 @@ def test_gradients_are_the_interpolation_weights(ad: Any) -> None:
         change[tuple(entry)] = 1
         expected = (slow_features(CONFIG, change, p) * slope).sum()
         assert gradient[tuple(entry)] == pytest.approx(expected, rel=1e-3, abs=1e-5)
+
+
+def test_two_threads_ask_two_tables(ad: Any) -> None:
+    """One grid, and each thread sees the table that it asks."""
+    grid = HashGrid(CONFIG, ad.Float)
+    p = vectors(ad, np.random.default_rng(1).uniform(-1, 1, (50, 3)).astype(np.float32))
+    wrong = []
+
+    def ask(level: float) -> None:
+        numbers = dr.full(ad.TensorXf, level, (CONFIG.entries(), CONFIG.features))
+        for _ in range(40):
+            try:
+                found = np.stack([np.array(f) for f in grid.features(p, numbers)])
+            except Exception as error:
+                wrong.append(error)
+                continue
+            if np.abs(found - level).max() > 1e-3:
+                wrong.append(found)
+
+    threads = [Thread(target=ask, args=(level,)) for level in (1.0, 2.0)]
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        sys.setswitchinterval(interval)
+    assert wrong == []
+
+
+def test_nothing_stays_behind_a_failure(ad: Any) -> None:
+    """A table that was asked in vain is not kept by the grid."""
+    grid = HashGrid(CONFIG, ad.Float)
+    with pytest.raises(TypeError):
+        grid.features(object(), ad.TensorXf(table(CONFIG)))
+    assert grid._encoding.data is None
 
 
 @pytest.mark.parametrize(

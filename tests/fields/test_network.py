@@ -76,7 +76,7 @@ def inputs(count: int) -> tuple[np.ndarray, np.ndarray]:
 
 def fast_forward(config: NetworkConfig, weights: dict[str, Any], x: Any, d: Any) -> tuple[Any, Any]:
     h = network.trunk(config, weights, x)
-    return network.density_head(weights, h), network.color_head(config, weights, h, d)
+    return network.density_head(config, weights, h), network.color_head(config, weights, h, d)
 
 
 # ---- Shape ------------------------------------------------------------------

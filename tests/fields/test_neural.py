@@ -15,6 +15,9 @@ from mi_nerf.fields.network import NetworkConfig, initial_weights
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
 from mi_nerf.fields.noise import DensityNoise
 from mi_nerf.fields.protocol import Field
+from mi_nerf.march.marched import MarchedField
+from mi_nerf.march.render import render_rays
+from mi_nerf.march.settings import MarchSettings
 from tests.support.arrays import unit, vectors
 
 SMALL = NeuralFieldConfig(
@@ -165,6 +168,29 @@ def test_protocol(ad: Any) -> None:
     assert (field.lower, field.upper, field.color_space) == (SMALL.lower, SMALL.upper, "srgb")
 
 
+def test_a_field_need_not_say_more(ad: Any) -> None:
+    """Without a coarse field, without a projection, and without a faster way."""
+
+    class Fog(Field):
+        lower, upper, color_space = (-1.0, -1.0, -1.0), (1.0, 1.0, 1.0), "linear"
+
+        def density(self, p: Any) -> Any:
+            return dr.full(type(p[0]), 0.5, len(p[0]))
+
+        def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+            return self.density(p), [self.density(p)] * 3
+
+        def parameters(self) -> dict[str, Any]:
+            return {}
+
+    o, d = vectors(ad, [(0.1, -3, 0.2)]), vectors(ad, [(0, 1, 0)])
+    for fine in (0, 8):
+        seen = render_rays(MarchedField(Fog(), MarchSettings(samples=8, fine=fine)), o, d)
+        assert seen.opacity[0] == pytest.approx(1 - math.exp(-1), abs=1e-6)
+    with pytest.raises(TypeError, match="density"):
+        type("Half", (Fog,), {"density": Field.density})()
+
+
 def test_published_parameter_count() -> None:
     assert NeuralFieldConfig().parameter_count() == 595_844
 
@@ -260,6 +286,20 @@ def test_density_noise_acts_before_the_activation(ad: Any) -> None:
     field = NeuralField.create(config, 0, ad.TensorXf)
     p = ad.Array3f(np.random.default_rng(0).uniform(-1, 1, (3, 50)).astype(np.float32))
     clean = np.array(field.density(p), np.float64)
-    field.noise = DensityNoise(1.0, 3)
-    raw = np.log(np.expm1(clean)) + np.array(field.noise.at(p), np.float64)
-    assert np.array(field.density(p)) == pytest.approx(np.log1p(np.exp(raw)), rel=1e-4)
+    raw = np.log(np.expm1(clean)) + np.array(DensityNoise(1.0, 3).at(p), np.float64)
+    noisy = np.array(field.for_training(noise=1.0, seed=3).density(p))
+    assert noisy == pytest.approx(np.log1p(np.exp(raw)), rel=1e-4)
+    assert (np.array(field.density(p)) == clean).all()
+
+
+def test_training_looks_at_the_same_weights(ad: Any) -> None:
+    """Also at those that come later; the coarse field has noise of its own."""
+    field = NeuralField.create(SMALL, 0, ad.TensorXf, NeuralField.create(SMALL, 0, ad.TensorXf))
+    view = field.for_training(noise=1.0, seed=5)
+    assert view.parameters() is field.parameters() and view.coarse is not None
+    p = vectors(ad, queries()[0].astype(np.float32))
+    fine, coarse = np.array(view.density(p)), np.array(view.coarse.density(p))
+    assert (fine == np.array(field.for_training(noise=1.0, seed=5).density(p))).all()
+    assert (coarse == np.array(field.for_training(noise=1.0, seed=6).density(p))).all()
+    field.parameters()["density.bias"] = ad.TensorXf([40.0])
+    assert (np.array(view.density(p)) > 20).all()

@@ -65,7 +65,7 @@ class Medium:
         }
 
     def field(self, ad: Any) -> AnalyticField:
-        """The table behind the Field protocol."""
+        """The table as a field."""
         n = self.numbers()
         lower, size = (self.scale * v for v in (n["lower"], n["upper"] - n["lower"]))
         low, rate = (vectors(ad, [v]) for v in (lower, CELLS / size))

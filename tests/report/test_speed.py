@@ -138,8 +138,8 @@ def test_every_setting_once_and_the_own_first() -> None:
 
 def test_splits_make_equally_many_queries() -> None:
     """Counted while the field is rendered: 2 · coarse + fine samples of rays in the box."""
-    field = NeuralField.create(SMALL, 0, BACKEND.TensorXf)
-    field.coarse = NeuralField.create(SMALL, 1, BACKEND.TensorXf)
+    coarse = NeuralField.create(SMALL, 1, BACKEND.TensorXf)
+    field = NeuralField.create(SMALL, 0, BACKEND.TensorXf, coarse)
     subject = subject_of(field, MarchSettings(samples=8, fine=16))
     found = settings_of(subject, Knobs(samples=(4,), rules=("constant",), splits=(0, 0.125, 0.25)))
     splits = [s.march for s, names in found.items() if "split" in names]

@@ -10,9 +10,10 @@ import drjit as dr
 from mi_nerf.base.box import Corner
 from mi_nerf.base.color import ColorSpace
 from mi_nerf.cameras.ndc import Ndc
+from mi_nerf.fields.protocol import Field
 
 
-class AnalyticField:
+class AnalyticField(Field):
     """Density σ(p) and colour c(p, d) as Dr.Jit functions, of parameters if need be."""
 
     color_space: ColorSpace = "linear"

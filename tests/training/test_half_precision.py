@@ -18,6 +18,7 @@ from mi_nerf.fields.fourier import FourierEncoding
 from mi_nerf.fields.hash_grid import HashGridConfig
 from mi_nerf.fields.network import NetworkConfig
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
+from mi_nerf.march.render import render_rays
 from mi_nerf.training import loss_scale
 from mi_nerf.training.checkpoint import Progress, load_checkpoint, save_checkpoint
 from mi_nerf.training.config import TrainConfig, with_settings
@@ -50,7 +51,8 @@ def gradients(
     field = NeuralField.create(config, 3, ad.TensorXf)
     weights = {n: w + rng.normal(0, 0.2, w.shape) for n, w in field.weights().items()}
     field = NeuralField(config, {n: w.astype(np.float32) for n, w in weights.items()}, ad.TensorXf)
-    field.loss_scale = None if scale is None else dr.opaque(ad.Float, scale)
+    if scale is not None:
+        field = field.for_training(loss_scale=dr.opaque(ad.Float, scale))
     p, d = (vectors(ad, v) for v in (rng.uniform(-1, 1, (200, 3)), unit(rng.normal(size=(200, 3)))))
     dr.enable_grad(field.parameters())
     dr.enable_grad(p)
@@ -93,6 +95,26 @@ def test_small_gradients_need_the_scale(ad: Any) -> None:
 def test_too_large_a_scale_shows(ad: Any) -> None:
     found = gradients(ad, BASE, 2.0**24)
     assert not np.isfinite(found["trunk_0.weight"]).all()
+
+
+@pytest.mark.parametrize("config", CONFIGS)
+def test_overflowing_activations_show(ad: Any, config: NeuralFieldConfig) -> None:
+    """An answer is right to its precision or not finite, never something in between."""
+    rng, size = np.random.default_rng(2), 2.0**15
+    weights = {n: rng.normal(0, 0.4, shape) for n, shape in config.shapes().items()}
+    # In exact numbers, the rectifier makes up for it; a half ends at 65504.
+    factors = {"trunk_0.weight": size, "trunk_0.bias": size, "trunk_1.weight": 1 / size}
+    weights |= {name: weights[name] * factor for name, factor in factors.items()}
+    field = NeuralField(config, {n: w.astype(np.float32) for n, w in weights.items()}, ad.TensorXf)
+    p, d = (vectors(ad, v) for v in (rng.uniform(-1, 1, (500, 3)), unit(rng.normal(size=(500, 3)))))
+    answers = []
+    for network in (field, field.for_training(loss_scale=dr.opaque(ad.Float, 64.0))):
+        density, color = network.density_emission(p, d)
+        answers.append(np.array([np.array(a, float) for a in (density, *color)]))
+    expected, found = answers
+    finite = np.isfinite(found)
+    assert np.isfinite(expected).all() and 50 < finite.all(axis=0).sum() < 500
+    np.testing.assert_allclose(found[finite], expected[finite], rtol=0.1, atol=0.05)
 
 
 def test_the_scale_follows_what_happens(ad: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -156,6 +178,22 @@ def test_an_overflow_is_declined_and_answered(ad: Any, views: Dataset) -> None:
     assert float(trainer.loss_scale.value[0]) == 2.0**39
     for name, weight in trainer.field.weights().items():
         np.testing.assert_array_equal(weight, before[name])
+
+
+def test_overflowing_activations_are_declined(ad: Any, views: Dataset) -> None:
+    """And single precision, in which everything else looks at the field, is not concerned."""
+    trainer = Trainer(small("occupancy.enabled=false"), views, ad)
+    assert trainer.loss_scale is not None
+    trainer.optimizer.assign("trunk_0.weight", trainer.field.parameters()["trunk_0.weight"] * 1e8)
+    trainer.optimizer.assign("density.weight", trainer.field.parameters()["density.weight"] * 1e-8)
+    before, scale = trainer.field.weights(), float(trainer.loss_scale.value[0])
+    assert not trainer.step(1e-2).accepted[0]
+    assert float(trainer.loss_scale.value[0]) == scale / 2
+    for name, weight in trainer.field.weights().items():
+        np.testing.assert_array_equal(weight, before[name])
+    o, d = vectors(ad, [(0.1, -3, 0.2)]), vectors(ad, [(0, 1, 0)])
+    seen = render_rays(trainer.field, o, d, trainer.march_settings())
+    assert np.isfinite([c[0] for c in (*seen.color, seen.opacity)]).all()
 
 
 def test_it_goes_on_from_a_checkpoint(ad: Any, views: Dataset, tmp_path: Path) -> None:

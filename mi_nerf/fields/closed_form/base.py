@@ -13,10 +13,10 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ...base.arrays import upload, vector3_type
+from ...base.arrays import Floats, Vectors, upload, vector3_type
 from ...base.box import Corner
 from ...base.color import ColorSpace
-from ...cameras.ndc import Ndc
+from ..protocol import Field
 
 
 def number(
@@ -80,14 +80,13 @@ def _is_number(value: Any) -> bool:
     return not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
 
 
-class ClosedFormField(ABC):
-    """A formula behind the Field protocol; every number of it is differentiable.
+class ClosedFormField(Field):
+    """A formula as a field; every number of it is differentiable.
 
     The box is no parameter: it stays as it was when numbers change.
     """
 
     color_space: ColorSpace = "linear"
-    ndc: Ndc | None = None
 
     def __init__(self, config: Any, tensor_type: Any) -> None:
         """Uploads the numbers of ``config`` as ``tensor_type`` (such as ``mi.TensorXf``)."""
@@ -104,34 +103,34 @@ class ClosedFormField(ABC):
         return self._parameters
 
     @abstractmethod
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points of the box, in 1/scene unit."""
 
-    def emission(self, d: Any) -> Any:
+    def emission(self, d: Vectors) -> Vectors:
         """The radiance along N directions, as a 3-vector of linear RGB."""
         return self.vector("radiance", d)
 
-    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+    def density_emission(self, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         """σ in 1/scene unit and the radiance along ``d``, linear RGB."""
         density = self.density(p)
         everywhere = dr.zeros(type(density), len(density))
         return density, [channel + everywhere for channel in self.emission(d)]
 
-    def vector(self, name: str, p: Any) -> Any:
+    def vector(self, name: str, p: Vectors) -> Vectors:
         """A parameter of three entries as a 3-vector of the precision of ``p``."""
         float_type = type(p[0])
         return vector3_type(float_type)(*(self._entry(name, i, float_type) for i in range(3)))
 
-    def scalar(self, name: str, p: Any) -> Any:
+    def scalar(self, name: str, p: Vectors) -> Floats:
         """A parameter of one entry, of the precision of ``p``."""
         return self._entry(name, 0, type(p[0]))
 
-    def _entry(self, name: str, i: int, float_type: Any) -> Any:
+    def _entry(self, name: str, i: int, float_type: Any) -> Floats:
         """An array of one element, with its history."""
         return dr.gather(float_type, self._parameters[name].array, dr.uint32_array_t(float_type)(i))
 
 
-def rise(x: Any, edge: Any) -> Any:
+def rise(x: Floats, edge: Floats) -> Floats:
     """From 0 to 1 where ``x`` goes from −edge/2 to edge/2, linearly: clip(x/edge + ½, 0, 1).
 
     With an ``edge`` of 0 it jumps. The derivative of an integral across a jump with respect

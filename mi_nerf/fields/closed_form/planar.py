@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
+from ...base.arrays import Floats, Vectors
 from ...base.box import Corner
 from .base import ClosedFormConfig, ClosedFormField, number, rise
 
@@ -66,7 +66,7 @@ class _PlanarConfig(_AxisConfig):
 class _PlanarField(ClosedFormField):
     """A field that varies with the distance from a plane."""
 
-    def distance(self, p: Any) -> Any:
+    def distance(self, p: Vectors) -> Floats:
         """s of N points, in scene units; negative before the plane."""
         axis = dr.normalize(self.vector("axis", p))
         return dr.dot(axis, p) - self.scalar("position", p)
@@ -83,9 +83,9 @@ class SlabConfig(_BoxConfig):
 
 
 class SlabField(ClosedFormField):
-    """:class:`SlabConfig` behind the Field protocol."""
+    """:class:`SlabConfig` as a field."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         return self.scalar("density", p) + dr.zeros(type(p[0]), len(p[0]))
 
@@ -104,9 +104,9 @@ class TwoColorConfig(_AxisConfig):
 
 
 class TwoColorField(SlabField):
-    """:class:`TwoColorConfig` behind the Field protocol."""
+    """:class:`TwoColorConfig` as a field."""
 
-    def emission(self, d: Any) -> Any:
+    def emission(self, d: Vectors) -> Vectors:
         """The radiance along N directions, as a 3-vector of linear RGB."""
         share = 0.5 + 0.5 * dr.dot(dr.normalize(self.vector("axis", d)), d)
         opposite = self.vector("opposite", d)
@@ -129,9 +129,9 @@ class FogConfig(_PlanarConfig):
 
 
 class FogField(_PlanarField):
-    """:class:`FogConfig` behind the Field protocol; its density ends at density · exp(60)."""
+    """:class:`FogConfig` as a field; its density ends at density · exp(60)."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         exponent = -self.distance(p) / self.scalar("height", p)
         return self.scalar("density", p) * dr.exp(dr.minimum(exponent, _MAX_EXPONENT))
@@ -150,9 +150,9 @@ class RampConfig(_PlanarConfig):
 
 
 class RampField(_PlanarField):
-    """:class:`RampConfig` behind the Field protocol."""
+    """:class:`RampConfig` as a field."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         line = self.scalar("density", p) + self.scalar("slope", p) * self.distance(p)
         return dr.maximum(line, 0)
@@ -174,9 +174,9 @@ class StepConfig(_PlanarConfig):
 
 
 class StepField(_PlanarField):
-    """:class:`StepConfig` behind the Field protocol."""
+    """:class:`StepConfig` as a field."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         before, beyond = self.scalar("before", p), self.scalar("beyond", p)
         return before + (beyond - before) * rise(self.distance(p), self.scalar("edge", p))
@@ -208,9 +208,9 @@ class SheetConfig(_PlanarConfig):
 
 
 class SheetField(_PlanarField):
-    """:class:`SheetConfig` behind the Field protocol."""
+    """:class:`SheetConfig` as a field."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         width = self.scalar("width", p)
         inside = rise(width / 2 - dr.abs(self.distance(p)), self.scalar("edge", p))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 
+from ...base.arrays import Floats, Vectors
 from ...base.box import Corner
 from .base import ClosedFormConfig, ClosedFormField, number, rise
 
@@ -37,9 +37,9 @@ class GaussianConfig(ClosedFormConfig):
 
 
 class GaussianField(ClosedFormField):
-    """:class:`GaussianConfig` behind the Field protocol."""
+    """:class:`GaussianConfig` as a field."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         offset = (p - self.vector("center", p)) / self.scalar("width", p)
         return self.scalar("peak", p) * dr.exp(-0.5 * dr.squared_norm(offset))
@@ -77,9 +77,9 @@ class ShellConfig(ClosedFormConfig):
 
 
 class ShellField(ClosedFormField):
-    """:class:`ShellConfig` behind the Field protocol."""
+    """:class:`ShellConfig` as a field."""
 
-    def density(self, p: Any) -> Any:
+    def density(self, p: Vectors) -> Floats:
         """σ at N points, in 1/scene unit."""
         square = dr.squared_norm(p - self.vector("center", p))
         r = dr.sqrt(dr.maximum(square, dr.smallest(type(square))))  # finite slope in the centre
