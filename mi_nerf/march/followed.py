@@ -83,7 +83,7 @@ class FollowedGrid(OccupancyGrid):
         the neighbours of what is new count as full as well, since what is thin is easily missed.
         """
         with dr.suspend_grad():
-            ask, before = self._asker(field), self.mask()
+            ask, before = self._asker(field), self._mask
             probed = ask(self._probes)
             stands = self._verdict and self._alike(self._probed, probed) >= _MOST
             least = 1 if self._alike(self._last, probed) >= 1 - _FEW else _LEAST_LOOKS
@@ -114,9 +114,10 @@ class FollowedGrid(OccupancyGrid):
         self.draw_line(THRESHOLD)
         return int(dr.count(self._mask & ~old)[0])
 
-    def _spread(self, before: np.ndarray[Any, Any]) -> None:
+    def _spread(self, before: Any) -> None:
         """Counts the neighbours of new cells as full, for as long as nothing else is seen there."""
-        near = self._upload_mask(greatest_around(self.mask() & ~before))
+        new = np.array(self._mask & ~before).reshape(self.shape)
+        near = self._upload_mask(greatest_around(new))
         start = dr.opaque(self._float, self._start)
         self._values = dr.select(near, dr.maximum(self._values, start), self._values)
         self.draw_line(THRESHOLD)
