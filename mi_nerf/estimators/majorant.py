@@ -14,12 +14,12 @@ import numpy as np
 from ..base.arrays import Floats, Vectors, upload
 from ..base.box import grid_shape
 from ..fields.protocol import Field
-from ..march.occupancy import OccupancyGrid
+from ..march.occupancy import OccupancyGrid, greatest_around
 
 # Cells along the longest side of the box of a field without an occupancy grid.
 _RESOLUTION = 32
-# Points of every cell that are looked at, together up to _MOST_LOOKS, so many at a time.
-_LOOKS, _MOST_LOOKS, _BLOCK = 8, 1 << 20, 16384
+# Points of every cell that are looked at, together up to _MOST_LOOKS.
+_LOOKS, _MOST_LOOKS = 8, 1 << 20
 # A ray through the whole box meets this many collisions, even if the field is thinner.
 _LEAST_DEPTH = 1.0
 
@@ -64,13 +64,11 @@ class Majorants:
         """
         shape = grid_shape(field.lower, field.upper, _RESOLUTION)
         cells = np.ones(shape, bool) if occupancy is None else occupancy.mask()
-        grid = OccupancyGrid(field.lower, field.upper, cells, float_type)
-        rng, count = dr.rng(seed), int(cells.sum())
-        pairs = np.clip(_MOST_LOOKS // max(2 * count, 1), 1, _LOOKS // 2)  # a turn looks twice
-        for turn in range(-(-count // _BLOCK) * int(pairs)):
-            grid.refresh(field, rng, turn, queries=2 * _BLOCK, threshold=0, decay=1.0)
+        grid = OccupancyGrid.surveyed(
+            field, cells, float_type, looks=_LOOKS, most=_MOST_LOOKS, seed=seed
+        )
         densities = np.where(cells, grid.values(), 0)
-        densities = np.maximum(densities, 0.5 * _greatest_around(densities))
+        densities = np.maximum(densities, 0.5 * greatest_around(densities))
         return cls(
             field.lower,
             field.upper,
@@ -151,13 +149,3 @@ class Majorants:
 def least_majorant(field: Field) -> float:
     """The density that makes one collision per diagonal of a field's box."""
     return _LEAST_DEPTH / float(np.linalg.norm(np.subtract(field.upper, field.lower)))
-
-
-def _greatest_around(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """The greatest value of each cell and its 26 neighbours."""
-    for axis in range(3):
-        ends = [(1, 1) if i == axis else (0, 0) for i in range(3)]
-        padded = np.pad(values, ends, mode="edge")
-        parts = [padded.take(range(k, k + values.shape[axis]), axis) for k in range(3)]
-        values = np.maximum.reduce(parts)
-    return values

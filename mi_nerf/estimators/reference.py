@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import Floats, Vectors, upload, vector3_type
 from ..fields.protocol import Field
+from ..march.blocks import ranges
 from ..march.intervals import RaySegments, ray_segments
 from ..march.occupancy import OccupancyGrid
 
@@ -266,9 +267,9 @@ class _March:
 
     def _blocks(self, index: NDArray[np.int64]) -> Iterator[tuple[Any, Any]]:
         """Parts of an index, and the same padded to a constant size."""
-        for start in range(0, len(index), self._block):
-            part = index[start : start + self._block]
-            yield part, np.pad(part, (0, self._block - len(part)), mode="edge")
+        for start, size in ranges(len(index), self._block):
+            part = index[start : start + size]
+            yield part, np.pad(part, (0, size - len(part)), mode="edge")
 
     def _vectors(self, v: Array) -> Vectors:
         return vector3_type(self._float)(*(upload(self._float, row) for row in v.T))

@@ -25,6 +25,7 @@ import drjit as dr
 
 from ..base.arrays import Floats, Indices, gather_vector3
 from ..fields.protocol import Field
+from ..march.blocks import ranges
 from ..march.intervals import RaySegments
 from ..march.strata import points_along
 from .majorant import Majorants
@@ -188,9 +189,7 @@ class _Asker:
             return self._query(segments, live)
         float_type, uint = type(live.t), type(live.ray)
         outputs = [dr.zeros(float_type, count) for _ in range(4)]
-        start = 0
-        while start < count:
-            size = self._block if count - start >= self._block else min(_SMALL_BLOCK, self._block)
+        for start, size in ranges(count, self._block, _SMALL_BLOCK):
             slot = dr.arange(uint, size) + dr.opaque(uint, start)
             valid = slot < dr.opaque(uint, count)
             where = dr.select(valid, slot, 0)
@@ -198,7 +197,6 @@ class _Asker:
             for output, value in zip(outputs, (density, *emission), strict=True):
                 dr.scatter(output, value, slot, valid)
             dr.eval(outputs)
-            start += size
         return outputs[0], outputs[1:]
 
     def _query(self, segments: RaySegments, live: _Live) -> tuple[Floats, list[Floats]]:

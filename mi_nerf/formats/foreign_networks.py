@@ -8,13 +8,11 @@ Their densities are per unit of length of world space, as here.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import drjit as dr
 import numpy as np
 
 from ..base.box import Corner, grid_shape
@@ -24,7 +22,7 @@ from ..base.variants import array_module
 from ..fields.fourier import Convention, FourierEncoding
 from ..fields.network import NetworkConfig
 from ..fields.neural import NeuralFieldConfig
-from ..march.occupancy import OccupancyGrid
+from ..march.occupancy import THRESHOLD, OccupancyGrid, greatest_around
 from ..march.settings import MarchSettings
 from .field_file import FieldFile
 from .torch_file import Checkpoint, read_checkpoint
@@ -32,11 +30,7 @@ from .torch_pickle import StoredTensor
 
 Which = Literal["fine", "coarse"]
 
-# Optical thickness below which a cell counts as empty, as in training, and how often a
-# random point of each cell is looked at before it does.
-_THRESHOLD = 0.01
-_LOOKS = 4
-_BLOCK = 16384
+_LOOKS = 4  # at random points of each cell, before it counts as empty
 
 
 @dataclass(frozen=True)
@@ -110,18 +104,10 @@ def occupied_cells(contents: FieldFile, variant: str, resolution: int) -> np.nda
     """
     backend = array_module(variant)
     field, _ = contents.build(backend)
-    shape = grid_shape(field.lower, field.upper, resolution)
-    grid = OccupancyGrid(field.lower, field.upper, np.ones(shape, bool), backend.Float)
-    rng = dr.rng(0)
-    for turn in range(_LOOKS * -(-math.prod(shape) // _BLOCK)):
-        grid.refresh(field, rng, turn, queries=2 * _BLOCK, threshold=_THRESHOLD, decay=1.0)
-    cells = grid.mask()
-    # What is thin and was missed lies beside what was seen.
-    for axis in range(3):
-        padded = np.pad(cells, [(int(i == axis), int(i == axis)) for i in range(3)])
-        near = [np.take(padded, range(k, k + shape[axis]), axis) for k in range(3)]
-        cells = near[0] | near[1] | near[2]
-    return cells
+    cells = np.ones(grid_shape(field.lower, field.upper, resolution), bool)
+    grid = OccupancyGrid.surveyed(field, cells, backend.Float, looks=_LOOKS)
+    grid.draw_line(THRESHOLD)
+    return greatest_around(grid.mask())  # what is thin and was missed lies beside what was seen
 
 
 # --------------------------------------------------------------------------

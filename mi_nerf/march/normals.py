@@ -6,6 +6,7 @@ import drjit as dr
 
 from ..base.arrays import Floats, Indices
 from ..fields.protocol import Field
+from .blocks import blocks
 from .samples import Samples
 from .strata import points_along
 
@@ -19,13 +20,10 @@ def density_gradient(field: Field, samples: Samples, index: Indices, block: int)
     Args:
         block: queries the network evaluates at a time.
     """
-    float_type, uint = type(samples.t), type(index)
+    float_type = type(samples.t)
     result = [dr.zeros(float_type, len(samples.t)) for _ in range(3)]
     dr.make_opaque(result)
-    for start in range(0, len(index), block):
-        slot = dr.arange(uint, block) + dr.opaque(uint, start)
-        valid = slot < dr.opaque(uint, len(index))
-        where = dr.gather(uint, index, slot, valid)
+    for _, valid, where in blocks(index, block):
         t = dr.gather(float_type, dr.detach(samples.t), where)
         o, d = dr.detach(samples.o), dr.detach(samples.d)
         p = points_along(o, d, t, where // samples.count)

@@ -23,6 +23,9 @@ from ..fields.protocol import Field
 # Value of a cell that was never looked at: occupied whatever the threshold.
 _UNSEEN = np.float32(np.finfo(np.float32).max)
 
+# Optical thickness of a cell below which it counts as empty, where nothing else is said.
+THRESHOLD = 0.01
+
 # Share of the threshold below which a cell is empty even if the whole scene is that thin.
 FAINTEST = 1e-4
 
@@ -50,6 +53,37 @@ class OccupancyGrid:
         self._values = upload(float_type, np.where(cells.ravel(), _UNSEEN, 0))
         self._floor = dr.zeros(float_type, cells.size)
         self._hull = self._mask = self._upload_mask(cells)
+
+    @classmethod
+    def surveyed(
+        cls,
+        field: Field,
+        cells: np.ndarray[Any, Any],
+        float_type: Any,
+        *,
+        looks: int,
+        most: int | None = None,
+        seed: int = 0,
+        block: int = 16384,
+    ) -> OccupancyGrid:
+        """A grid that remembers the greatest density seen in each of ``cells``.
+
+        All of them are marked as sampled: :meth:`draw_line` tells which are not empty.
+
+        Args:
+            cells: (X, Y, Z) booleans over the box of the field; the others are empty.
+            looks: at as many random points of each cell, an even number.
+            most: looks at all cells together, but for two at each.
+            block: points at a time.
+        """
+        grid = cls(field.lower, field.upper, cells, float_type)
+        count, pairs = int(cells.sum()), looks // 2  # a refresh looks at all cells twice
+        if most is not None:
+            pairs = min(max(most // max(2 * count, 1), 1), pairs)
+        rng = dr.rng(seed)
+        for turn in range(-(-count // block) * pairs):
+            grid.refresh(field, rng, turn, queries=2 * block, threshold=0, decay=1.0)
+        return grid
 
     @property
     def cell_size(self) -> np.ndarray[Any, Any]:
@@ -96,10 +130,7 @@ class OccupancyGrid:
 
         Half of them take their turn among all cells that are not known to be empty for
         good, half among those sampled now. A value decays by ``decay`` at every look and
-        never stays below the density just seen; a cell counts as empty once its value
-        times the mean edge length is below ``threshold``, or below half the mean over all
-        cells where that is less, as in a scene that is nothing but thin fog. Below
-        :data:`FAINTEST` of the threshold even such fog counts as nothing.
+        never stays below the density just seen; :meth:`draw_line` says what is empty then.
 
         Args:
             rng: a Dr.Jit generator, for the place within each cell.
@@ -110,6 +141,15 @@ class OccupancyGrid:
         for pool in (self._candidates, sampled):
             if len(pool):
                 self._look(field, pool, turn * half, half, rng, decay)
+        self.draw_line(threshold)
+
+    def draw_line(self, threshold: float) -> None:
+        """Marks cells as empty whose value times the mean edge length is below ``threshold``.
+
+        Or below half the mean over all cells where that is less, as in a scene that is
+        nothing but thin fog. Below :data:`FAINTEST` of the threshold even such fog counts
+        as nothing. With 0, all cells are kept that are not empty for good.
+        """
         limit = dr.opaque(self._float, threshold / float(np.mean(self.cell_size)))
         seen = self._hull & (self._values < float(_UNSEEN))
         total = dr.sum(dr.select(seen, self._values, 0))
@@ -152,18 +192,7 @@ class OccupancyGrid:
         cell = dr.gather(
             uint, pool, (slot + dr.opaque(uint, first % len(pool))) % dr.opaque(uint, len(pool))
         )
-        rest = cell
-        where: list[Any] = []
-        for size in reversed(self.shape):
-            where.insert(0, rest % size)
-            rest = rest // size
-        p = vector3_type(self._float)(
-            *(
-                (self._float(w) + rng.random(self._float, count)) * float(s) + float(low)
-                for w, s, low in zip(where, self.cell_size, self.lower, strict=True)
-            )
-        )
-        dr.eval(p, cell)
+        p = self._points(cell, rng)
         with dr.suspend_grad():
             density = field.density(p)
             old = dr.gather(self._float, self._values, cell)
@@ -173,3 +202,28 @@ class OccupancyGrid:
             dr.scatter(self._values, dr.fmax(old, density), cell, new)
             dr.scatter(self._floor, dr.fmin(risen, density), cell, new)
             dr.eval(self._values, self._floor)
+
+    def _points(self, cell: Any, rng: Any) -> Any:
+        """A random point in each of these cells."""
+        rest, where = cell, list[Any]()
+        for size in reversed(self.shape):
+            where.insert(0, rest % size)
+            rest = rest // size
+        p = vector3_type(self._float)(
+            *(
+                (self._float(w) + rng.random(self._float, len(cell))) * float(s) + float(low)
+                for w, s, low in zip(where, self.cell_size, self.lower, strict=True)
+            )
+        )
+        dr.eval(p, cell)
+        return p
+
+
+def greatest_around(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """The greatest of each of (X, Y, Z) cells and its 26 neighbours, of booleans whether any."""
+    for axis in range(3):
+        ends = [(1, 1) if i == axis else (0, 0) for i in range(3)]
+        padded = np.pad(values, ends, mode="edge")
+        parts = [padded.take(range(k, k + values.shape[axis]), axis) for k in range(3)]
+        values = np.maximum.reduce(parts)
+    return values

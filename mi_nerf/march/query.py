@@ -12,6 +12,7 @@ import drjit as dr
 from ..base.arrays import Floats, Indices, Mask, gather_vector3
 from ..base.kernel_stages import stage
 from ..fields.protocol import Field
+from .blocks import blocks
 from .samples import Samples
 from .strata import points_along
 
@@ -184,23 +185,11 @@ class Evaluation:
 
     def _blocks(self, index: Indices, block: int) -> Iterator[tuple[Indices, Mask]]:
         """Sample numbers and validity of each block; the last one is padded."""
-        uint = type(index)
-        for start, size in self._ranges(len(index), block):
-            slot = dr.arange(uint, size) + dr.opaque(uint, start)
-            valid = slot < dr.opaque(uint, len(index))
-            where = dr.gather(uint, index, slot, valid)
+        tail = self._tail if block == self._block else None
+        for _, valid, where in blocks(index, block, tail):
             with stage("samples"):
                 dr.eval(where, valid)
             yield where, valid
-
-    def _ranges(self, queries: int, block: int) -> Iterator[tuple[int, int]]:
-        """Starts and sizes of blocks."""
-        small = min(self._tail, block) if block == self._block else block
-        start = 0
-        while start < queries:
-            size = block if queries - start > block - small else small
-            yield start, size
-            start += size
 
     def _query(self, where: Indices, fused: Any = None) -> list[Floats]:
         samples = self._samples

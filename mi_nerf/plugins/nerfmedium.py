@@ -10,7 +10,8 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..fields.closed_form import closed_form
-from ..formats.field_file import load_field
+from ..formats.field_file import FieldFile, load_field
+from ..march.followed import FollowedGrid
 from ..march.settings import MarchSettings
 
 
@@ -34,7 +35,8 @@ class NerfMedium(mi.Medium):
          :monosp:`gaussian` or :monosp:`shell`, and then its parameters, listed below.
      * - occupancy
        - |bool|
-       - Skip the cells that the field file marks as empty. (Default: true)
+       - Skip the cells that the field file marks as empty. When weights change, so do these
+         cells: the field is looked at again before the next picture. (Default: true)
      * - to_world
        - |transform|
        - Moves the field within the cube's coordinate system: applied before the cube's own
@@ -148,6 +150,8 @@ class NerfMedium(mi.Medium):
         matrix = props.get("to_world", mi.ScalarTransform4f()).matrix
         self.to_world = mi.Transform4f(np.array(matrix, np.float32))
         self._grid: Any = None
+        self._contents: FieldFile | None = None  # what the grid belongs to, until weights change
+        self._stale = False
         self.field: Any
         if "field" in props:
             self._describe_formula(props)
@@ -162,6 +166,7 @@ class NerfMedium(mi.Medium):
         contents = load_field(path)
         self._source = path
         self.field, self._grid = contents.build(mi)
+        self._contents = contents if self._use_occupancy and self._grid is not None else None
         self.march = contents.march
 
     def _describe_formula(self, props: mi.Properties) -> None:
@@ -177,8 +182,17 @@ class NerfMedium(mi.Medium):
 
     @property
     def occupancy(self) -> Any:
-        """The grid of cells that may hold something, or ``None``."""
-        return self._grid if self._use_occupancy else None
+        """The grid of cells that may hold something with the weights as they are, or ``None``."""
+        if not self._use_occupancy or self._grid is None:
+            return None
+        if self._stale:
+            if self._contents is not None:  # from here on, any cell may fill
+                before, _ = self._contents.build(mi)
+                self._grid = FollowedGrid(self._grid, before, mi.Float)
+                self._contents = None
+            self._grid.follow(self.field)
+            self._stale = False
+        return self._grid
 
     def traverse(self, callback: Any) -> None:
         """Exposes every tensor of the network, and ``to_world``, as differentiable parameters."""
@@ -188,9 +202,8 @@ class NerfMedium(mi.Medium):
         callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str] | None = None) -> None:
-        """New weights may fill cells that were empty: the grid no longer holds."""
-        if keys is None or any(k in self._names for k in keys):
-            self._grid = None
+        """New weights may fill cells that were empty: the next picture looks at them again."""
+        self._stale |= not keys or any(k in self._names for k in keys)
 
     # ---- What Mitsuba's own volume integrators find: nothing. Theirs would fail otherwise, ----
     # ---- in any scene, as long as a field exists anywhere.                                 ----
@@ -215,7 +228,7 @@ class NerfMedium(mi.Medium):
             f"  lower = {self.field.lower}, upper = {self.field.upper},\n"
             f"  color_space = {self.field.color_space},\n"
             f"  parameters = {list(self._names)},\n"
-            f"  occupancy = {self.occupancy is not None}\n"
+            f"  occupancy = {self._use_occupancy and self._grid is not None}\n"
             "]"
         )
 

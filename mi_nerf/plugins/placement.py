@@ -16,6 +16,7 @@ from ..base.errors import InputError
 Matrix = np.ndarray[Any, Any]
 
 _CORNERS = 24  # vertices of Mitsuba's cube: four for each face
+_ROUNDING = 4 * float(np.finfo(np.float32).eps)  # of a corner, relative to where it is
 
 
 @dataclass
@@ -138,7 +139,8 @@ def cubes_to_world(shape: mi.Shape) -> list[Matrix]:
         to_world[:3] = points @ _from_corners()
         _check_volume(to_world, "the cube's to_world")
         misfit = np.abs(to_world[:3] @ _unit_corners() - points).max()
-        if misfit > 1e-4 * np.abs(points - points.mean(axis=1, keepdims=True)).max():
+        size = np.abs(points - points.mean(axis=1, keepdims=True)).max()
+        if misfit > 1e-4 * size + _ROUNDING * np.abs(points).max():
             raise _no_cube(shape)
         found.append(to_world)
     return found

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,7 +14,6 @@ from ..march.occupancy import OccupancyGrid
 Cells = NDArray[np.bool_]
 
 _LOOKS, _MOST_LOOKS = 32, 1 << 21  # at random points of each cell, unless there are too many
-_BLOCK = 16384  # points at a time
 
 
 def own_resolution(grid: OccupancyGrid | None) -> int | None:
@@ -40,22 +38,14 @@ class Grids:
         if resolution not in self._seen:
             self._seen[resolution] = self._look(resolution)
         grid = self._seen[resolution]
-        # One look more, in which nothing decays, sets the mask.
-        rng = dr.rng(1)
-        grid.refresh(self._field, rng, 0, queries=2, threshold=threshold, decay=1.0)
+        grid.draw_line(threshold)
         return OccupancyGrid(grid.lower, grid.upper, grid.mask(), self._float)
 
     def _look(self, resolution: int) -> OccupancyGrid:
         field = self._field
         shape = grid_shape(field.lower, field.upper, resolution)
         cells = np.ones(shape, bool) if self._own is None else resampled(self._own.mask(), shape)
-        grid = OccupancyGrid(field.lower, field.upper, cells, self._float)
-        rng = dr.rng(0)
-        count = int(cells.sum())
-        pairs = int(np.clip(_MOST_LOOKS // max(2 * count, 1), 1, _LOOKS // 2))
-        for turn in range(-(-count // _BLOCK) * pairs):  # each looks at cells of two sets
-            grid.refresh(field, rng, turn, queries=2 * _BLOCK, threshold=0, decay=1.0)
-        return grid
+        return OccupancyGrid.surveyed(field, cells, self._float, looks=_LOOKS, most=_MOST_LOOKS)
 
 
 def resampled(cells: Cells, shape: tuple[int, int, int]) -> Cells:

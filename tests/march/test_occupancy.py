@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mi_nerf.base.box import grid_shape
-from mi_nerf.march.occupancy import OccupancyGrid
+from mi_nerf.march.occupancy import OccupancyGrid, greatest_around
 from tests.support.analytic import AnalyticField, ball, uniform
 from tests.support.arrays import vectors
 
@@ -254,3 +254,37 @@ def test_restore_refuses_another_shape(ad: Any) -> None:
 )
 def test_grid_shape(upper: Any, shape: tuple[int, int, int]) -> None:
     assert grid_shape((0.0, 0.0, 0.0), upper, 64) == shape
+
+
+# ---- Survey -----------------------------------------------------------------
+
+
+def test_a_survey_looks_everywhere_and_remembers_the_most(ad: Any) -> None:
+    cells = np.ones((CELLS,) * 3, bool)
+    cells[:, 2] = False
+    field = AnalyticField(lambda p: dr.select(p.x < 0, 9.0, 0.001))
+    grid = OccupancyGrid.surveyed(field, cells, ad.Float, looks=4, block=100)
+    assert np.array_equal(grid.mask(), cells)
+    expected = np.full((CELLS,) * 3, np.float32(0.001))
+    expected[: CELLS // 2] = 9
+    assert np.array_equal(grid.values(), np.where(cells, expected, 0))
+    assert 4 * cells.sum() <= field.asked <= 4 * (cells.sum() + 100)
+    grid.draw_line(0.01)
+    assert np.array_equal(grid.mask(), cells & (expected > 1))
+
+
+def test_a_survey_looks_at_every_cell_twice_however_few_are_wanted(ad: Any) -> None:
+    field = AnalyticField(uniform(3.0))
+    grid = OccupancyGrid.surveyed(
+        field, np.ones((4, 4, 4), bool), ad.Float, looks=8, most=1, block=64
+    )
+    assert (grid.values() == 3).all() and field.asked == 2 * 4**3
+
+
+def test_neighbours() -> None:
+    values = np.zeros((4, 5, 3), np.float32)
+    values[0, 2, 1], values[3, 4, 2] = 2, 7
+    found = greatest_around(values)
+    assert (found[:2, 1:4] == 2).all() and (found[2:, 3:, 1:] == 7).all()
+    assert (found > 0).sum() == 18 + 8
+    assert np.array_equal(greatest_around(values > 0), found > 0)

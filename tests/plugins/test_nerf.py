@@ -284,7 +284,7 @@ def test_weights_are_scene_parameters(variant: str, field: Path) -> None:
     assert "trunk" not in scene.integrator().to_string()
 
 
-def test_occupancy_is_dropped_when_weights_change(variant: str, tmp_path: Path) -> None:
+def test_a_grid_without_cells_does_not_hide_new_weights(variant: str, tmp_path: Path) -> None:
     contents = mi_nerf.load_field(small_file(tmp_path))
     empty = np.zeros((4, 4, 4), bool)
     path = tmp_path / "masked.safetensors"
