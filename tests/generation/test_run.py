@@ -371,7 +371,8 @@ def test_a_full_disk(tmp_path: Path) -> None:
     """Files may not grow beyond a few kilobytes: one line, nothing half-written."""
     scene, out = ball(tmp_path), tmp_path / "data"
     rest = ["--train", "2", "--size", "100", "100", "--spp", "4"]
-    # Dr.Jit writes compiled kernels to files too: the same process compiles them before.
+    # Dr.Jit writes compiled kernels to files too: the same process compiles them before. What
+    # is left depends on how memory happens to lie, and Dr.Jit says so in lines of its own.
     script = f"""
 import resource, sys
 from mi_nerf.cli import main
@@ -383,8 +384,8 @@ sys.exit(generate({str(out)!r}))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
-    assert done.stderr.startswith("mi-nerf: ") and done.stderr.count("\n") == 1
-    assert "cannot be written" in done.stderr
+    lines = [v for v in done.stderr.splitlines() if not v.startswith("jit_kernel_write(): ")]
+    assert len(lines) == 1 and lines[0].startswith("mi-nerf: ") and "cannot be written" in lines[0]
     files = [p for p in out.rglob("*") if p.is_file()]
     assert not [p.name for p in files if p.name.startswith(".")]
     for picture in (p for p in files if p.suffix == ".png"):

@@ -161,7 +161,7 @@ def test_row_09_high_octaves(ad: Any) -> None:
 
 
 def test_row_10_not_a_number(ad: Any) -> None:
-    """Steps skipped, counted and reported, and the end of a run: training/test_run.py, "Failures"."""
+    """Skipped steps are counted, and end a run: training/test_run.py, "Failures"."""
     passing, lost = measured(networks.not_a_number, ad)
     assert passing.naive == 0 and passing.ours == 1
     assert lost.naive == 50 and lost.ours == 0

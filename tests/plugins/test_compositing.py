@@ -334,11 +334,13 @@ def test_surfaces_are_left_out_without_a_nested_integrator() -> None:
 
 @pytest.mark.parametrize("nested", ["direct", "volpath", "prb", "prb_basic", "prbvolpath"])
 def test_nested_integrators_of_all_kinds(nested: str) -> None:
-    solids = {"wall": wall(0.2), "sky": sky()}
-    field = slab(place(), 0.5, GLOW)
-    image = render(scene_of(nerf(nested), field=field, **solids), spp=64)
-    path = render(scene_of(nerf({"type": "path", "max_depth": 2}), field=field, **solids), spp=64)
-    np.testing.assert_allclose(image, path, atol=0.05)
+    """They show what ``path`` shows: their means differ by no more than they scatter."""
+    solids = {"wall": wall(0.2), "sky": sky(), "field": slab(place(), 0.5, GLOW)}
+    two = [mi.load_dict(scene_of(nerf(kind), **solids)) for kind in (nested, "path")]
+    images = [render(two[0], spp=16, seed=i) - render(two[1], spp=16, seed=i) for i in range(16)]
+    mean, error = np.mean(images, axis=0), np.std(images, axis=0, ddof=1) / 4
+    assert np.abs(mean / np.hypot(error, 1e-3)).max() < 6
+    assert np.abs(mean.mean(axis=(0, 1))).max() < 2e-3
 
 
 def test_several_paths_a_ray_are_less_noisy() -> None:

@@ -382,13 +382,25 @@ def test_spiral_rises_in_two_turns() -> None:
     assert abs(angles[-1] - angles[0]) == pytest.approx(4 * np.pi * 39 / 40)
 
 
-@pytest.mark.parametrize("count", [1, 2])
-def test_paths_around_few_cameras(count: int) -> None:
-    """Even one camera gives finite paths that look at what it may be looking at."""
-    poses = orbit_poses(3)[:count]
-    for path in (orbit_like, spiral_like):
-        found = path(poses, 5)
-        assert found.shape == (5, 4, 4) and np.isfinite(found).all()
+@pytest.mark.parametrize("path", [orbit_like, spiral_like])
+def test_paths_around_two_cameras(path: Callable[..., np.ndarray]) -> None:
+    """Two axes meet in the point that both cameras look at, which is the paths' centre."""
+    poses = orbit_poses(3, radius=3.0, height=1.2)[:2]
+    assert look_center(poses) == pytest.approx(np.zeros(3), abs=1e-5)
+    assert_looks_at(path(poses, 5), look_center(poses), np.array([0.0, 0.0, 1.0]))
+    distance = np.linalg.norm(path(poses, 5)[:, :3, 3], axis=1)
+    assert distance == pytest.approx(np.full(5, np.hypot(3.0, 1.2)), abs=1e-4)
+
+
+@pytest.mark.parametrize("path", [orbit_like, spiral_like])
+def test_a_path_around_one_camera_turns_on_the_spot(path: Callable[..., np.ndarray]) -> None:
+    """Nothing tells how far away the thing is that the camera looks at."""
+    (pose,) = orbit_poses(1)
+    found = path(pose[None], 5)
+    assert found[:, :3, 3] == pytest.approx(np.tile(pose[:3, 3], (5, 1)), abs=1e-6)
+    for turned in found[:, :3, :3]:
+        assert turned.T @ turned == pytest.approx(np.eye(3), abs=1e-9)
+        assert turned[:, 1] @ [0, 0, 1] > 0
 
 
 def test_one_frame(blob: Path) -> None:

@@ -92,8 +92,18 @@ def test_steps_depend_on_the_seed_alone(views: Dataset) -> None:
 
 @pytest.mark.parametrize("background", ["white", "black", "random"])
 def test_backgrounds(views: Dataset, background: str) -> None:
-    trainer = Trainer(small(f"background={background}"), views, ad)
-    assert np.isfinite(float(trainer.step(1e-2).loss[0]))
+    """An empty field shows the background alone: its error against an even image is known."""
+    color, alpha = np.array([0.3, 0.2, 0.1]), 0.6
+    even = np.broadcast_to(np.float32([*color, alpha]), views.images.shape).copy()
+    rays = ("sampling.rays=4096", "sampling.batch=200000", "occupancy.enabled=false")
+    config = small(f"background={background}", *rays)
+    trainer = Trainer(config, replace(views, images=even), ad)
+    bias = trainer.field.parameters()["density.bias"]
+    trainer.optimizer.assign("density.bias", bias - 100)
+    behind = {"white": 1.0, "black": 0.0, "random": (np.arange(1000)[:, None] + 0.5) / 1000}
+    expected = np.square(color - alpha * behind[background]).mean()
+    error = 0.03 if background == "random" else 1e-5
+    assert float(trainer.step(1e-2).loss[0]) == pytest.approx(expected, rel=error)
 
 
 def test_incomplete_rays_do_not_count(views: Dataset) -> None:
