@@ -46,6 +46,7 @@ def test_every_public_name_is_there_and_explained() -> None:
         mi_nerf.qqq  # noqa: B018
 
 
+@pytest.mark.slow
 def test_importing_the_package_imports_no_training() -> None:
     code = "import sys, mi_nerf; print([m for m in sys.modules if m.startswith('mi_nerf.t')])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -55,6 +56,7 @@ def test_importing_the_package_imports_no_training() -> None:
     assert found.stdout.split() == ["start", "Run"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["mitsuba", "mi_nerf"])
 def test_before_or_after_the_variant_is_set(first: str, blob_run: Path) -> None:
     """And across a switch to a variant without derivatives, and back."""
@@ -93,6 +95,7 @@ def test_the_active_variant_holds(monkeypatch: pytest.MonkeyPatch) -> None:
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_settings_by_name_or_as_text(blob: Path, tmp_path: Path) -> None:
     options = {"downscale": 2, "seed": 3, "steps": 5, "preset": "fast"}
     named = {
@@ -117,6 +120,7 @@ def test_settings_by_name_or_as_text(blob: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "d").exists()
 
 
+@pytest.mark.slow
 def test_reports_are_the_lines_of_the_log(blob: Path, tmp_path: Path) -> None:
     run = mi_nerf.start(blob, tmp_path / "run", steps=6, settings=SMALL)
     reports = list(run.reports())
@@ -129,6 +133,7 @@ def test_reports_are_the_lines_of_the_log(blob: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(run.trainer.field.weights()[name], weights)
 
 
+@pytest.mark.slow
 def test_leaving_the_loop_saves_and_a_further_one_goes_on(blob: Path, tmp_path: Path) -> None:
     through = mi_nerf.start(blob, tmp_path / "through", steps=6, settings=SMALL)
     through.train(show_bar=False)
@@ -147,6 +152,7 @@ def test_leaving_the_loop_saves_and_a_further_one_goes_on(blob: Path, tmp_path: 
         np.testing.assert_array_equal(resumed.trainer.field.weights()[name], weights)
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_the_caller_looks_ends_training(blob: Path, tmp_path: Path) -> None:
     run = mi_nerf.start(blob, tmp_path / "run", steps=50, settings=SMALL)
     steps = []
@@ -158,6 +164,7 @@ def test_an_interrupt_while_the_caller_looks_ends_training(blob: Path, tmp_path:
     assert mi_nerf.start(blob, tmp_path / "run", resume=True).trainer.step_count == 3
 
 
+@pytest.mark.slow
 def test_only_training_takes_training_time(
     blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

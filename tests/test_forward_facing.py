@@ -248,6 +248,7 @@ def test_silhouettes_do_not_carve_projected_boxes(capture: Path) -> None:
     assert hull.tighten(transparent, *dataset.box) == dataset.box
 
 
+@pytest.mark.slow
 def test_training_learns_the_capture(forward_run: Path, tmp_path: Path) -> None:
     """Held-out views come out better than any one colour, in files that XML scenes load."""
     file = tmp_path / "result.json"
@@ -302,6 +303,7 @@ def test_spiral_is_the_path_of_forward_runs(
     assert "expected --path spiral or --path test" in message
 
 
+@pytest.mark.slow
 def test_report_of_a_capture(
     forward_run: Path, capture: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:

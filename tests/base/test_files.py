@@ -225,6 +225,7 @@ def test_a_failing_write_leaves_the_old_field(tmp_path: Path) -> None:
     assert names(tmp_path) == {"field.safetensors"}
 
 
+@pytest.mark.slow
 def test_nothing_in_a_run_is_half_written_or_pickled(blob_run: Path) -> None:
     assert names(blob_run) == {
         "config.json",

@@ -115,6 +115,7 @@ def test_row_05_opaque_walls(ad: Any) -> None:
 # ---- 6: dead density -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_row_06_dead_density(ad: Any) -> None:
     """How collapsed runs are found and restarted: training/test_run.py, "Failures"."""
     density, gradient, shifted = measured(networks.dead_density, ad)
@@ -123,6 +124,7 @@ def test_row_06_dead_density(ad: Any) -> None:
     assert shifted.naive == networks.SEEDS and shifted.ours == 0
 
 
+@pytest.mark.slow
 def test_row_06_the_published_activation_with_our_weights(ad: Any) -> None:
     """The preset ``paper`` keeps the ReLU."""
     assert preset("paper").density.activation == "relu"
@@ -231,6 +233,7 @@ def test_row_14_the_hierarchy_finds_what_its_samples_can_hit(ad: Any) -> None:
 # ---- 15: from inside ----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_row_15_inside_the_volume(ad: Any) -> None:
     """With near and far planes: march/test_render.py."""
     opacity, slope = measured(fields.inside_the_volume, ad)
@@ -241,12 +244,14 @@ def test_row_15_inside_the_volume(ad: Any) -> None:
 # ---- 16: the unit of the scene ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_row_16_scene_unit(ad: Any) -> None:
     opacity, slope = measured(fields.scene_unit, ad)
     assert opacity.naive > 0.99 and opacity.ours < 1e-5
     assert slope.naive > 0.99 and slope.ours < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [2.0**-10, 2.0**13])
 def test_row_16_training_knows_no_unit(ad: Any, views: Dataset, scale: float) -> None:
     """Powers of 2 change no digit: every step must be the same."""
@@ -267,6 +272,7 @@ def test_row_17_saturation(ad: Any) -> None:
     assert pull.naive == 0 and pull.ours > 0.1
 
 
+@pytest.mark.slow
 def test_row_17_white_objects_become_opaque(ad: Any, views: Dataset) -> None:
     """Training places images with alpha before random colours unless it is told otherwise."""
     images = views.images.copy()
@@ -290,6 +296,7 @@ def test_row_18_one_sample(ad: Any) -> None:
     assert math.isnan(error.naive) and error.ours < 1e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "width", "height"), [(1, 1, 1), (1, 9, 1), (1, 8, 8), (3, 1, 7)])
 def test_row_18_training_on_next_to_nothing(ad: Any, count: int, width: int, height: int) -> None:
     """One view, one pixel, one row, one column."""
@@ -311,12 +318,14 @@ def test_row_18_training_on_next_to_nothing(ad: Any, count: int, width: int, hei
     assert trainer.step(5e-3).queries > 0
 
 
+@pytest.mark.slow
 def test_row_18_steps_that_see_nothing(ad: Any, views: Dataset) -> None:
     """All views look away from the box."""
     config = small("box=20,20,20,21,21,21")
     assert np.isfinite(losses(Trainer(config, views, ad), 9)).all()
 
 
+@pytest.mark.slow
 def test_row_18_one_ray_and_one_sample_a_step(ad: Any, views: Dataset) -> None:
     config = small("sampling.rays=1", "sampling.samples=1", "sampling.batch=1")
     assert np.isfinite(losses(Trainer(config, views, ad), 9)).all()
@@ -330,6 +339,7 @@ def test_row_19_hdr_targets(ad: Any) -> None:
         assert finding.naive > 1e9 and finding.ours < 2
 
 
+@pytest.mark.slow
 def test_row_19_linear_images_get_the_relative_loss(ad: Any, views: Dataset) -> None:
     """From 1e-3 to 1e4 in one picture."""
     images = views.images.copy()
@@ -366,6 +376,7 @@ def test_row_20_corrections_for_bias_do_not_drift(ad: Any, start: int) -> None:
     assert -np.diff(places) == pytest.approx(np.full(20, 1e-2), rel=1e-3)
 
 
+@pytest.mark.slow
 def test_row_20_a_step_far_on(ad: Any, views: Dataset) -> None:
     """Seeds, refreshes and schedules of step 1e5 are numbers like any other."""
     trainer = Trainer(small(), views, ad)
@@ -399,6 +410,7 @@ def test_rows_are_those_of_the_documentation() -> None:
         assert f"| {case.row} | {case.name} | {case.naive} |" in PAGE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: str(case.row))
 def test_numbers_are_those_of_the_documentation(case: Case) -> None:
     rows = re.findall(rf"^\|.*\| ([^|]+) \| (\S+) \| (\S+) \| `{case.test}` \|$", PAGE, re.M)
@@ -409,6 +421,7 @@ def test_numbers_are_those_of_the_documentation(case: Case) -> None:
         assert all(map(agrees, printed, values)), (what, printed, values)
 
 
+@pytest.mark.slow
 def test_sheets_are_those_of_the_documentation() -> None:
     rows = re.findall(r"^\| (0\.\d+) \| (\S+) \| (\S+) \| (\S+) \|$", PAGE, re.M)
     assert [float(thickness) for thickness, *_ in rows] == list(fields.THICKNESSES)

@@ -43,6 +43,7 @@ def oracle(weights: np.ndarray, samples: int, near: float, far: float) -> np.nda
     return np.array(rows)
 
 
+@pytest.mark.slow
 @given(weights_of, st.integers(1, 50))
 def test_inversion_agrees_with_float64(weights: np.ndarray, samples: int) -> None:
     found, expected = invert(weights, samples), oracle(weights, samples, 2, 6)
@@ -82,6 +83,7 @@ def test_ends_are_exact(offset: float, power: int) -> None:
         assert np.abs(t - (far if offset else near)).max() <= 2e-6 * far
 
 
+@pytest.mark.slow
 @given(st.integers(0, 1000))
 def test_the_samples_follow_the_weights(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -105,6 +107,7 @@ rows = st.integers(1, 3).flatmap(
 )
 
 
+@pytest.mark.slow
 @given(rows)
 def test_merging_is_sorting(pair: tuple[np.ndarray, np.ndarray]) -> None:
     a, b = (np.sort(x, axis=1) for x in pair)
@@ -113,6 +116,7 @@ def test_merging_is_sorting(pair: tuple[np.ndarray, np.ndarray]) -> None:
     assert (np.array(merged).reshape(expected.shape) == expected).all()
 
 
+@pytest.mark.slow
 @given(
     hnp.arrays(
         np.float32,

@@ -58,6 +58,7 @@ def test_xml_finds_the_field_beside_the_scene(variant: str, field: Path) -> None
     assert image[3, 4, 3] > 0.5 and np.isfinite(image).all()
 
 
+@pytest.mark.slow
 def test_plugins_survive_variant_switches(field: Path) -> None:
     mi.set_variant("llvm_ad_rgb")
     before = render(scene_dict(field), seed=3)
@@ -161,6 +162,7 @@ def test_box_outside_the_unit_cube_appears_where_it_was_trained(
     assert alpha[6, 8] > 0.1 and alpha[0, 0] == 0
 
 
+@pytest.mark.slow
 def test_crop_window_is_a_part_of_the_whole(variant: str, field: Path) -> None:
     whole = scene_dict(field, size=(16, 12), spp=256)
     crop = {"crop_width": 5, "crop_height": 4, "crop_offset_x": 6, "crop_offset_y": 3}
@@ -169,6 +171,7 @@ def test_crop_window_is_a_part_of_the_whole(variant: str, field: Path) -> None:
     np.testing.assert_allclose(part, render(whole)[3:7, 6:11], atol=0.02)
 
 
+@pytest.mark.slow
 def test_seed_and_spp(variant: str, field: Path) -> None:
     scene = mi.load_dict(scene_dict(field))
     first = np.array(mi.render(scene, seed=5))
@@ -181,6 +184,7 @@ def test_seed_and_spp(variant: str, field: Path) -> None:
     assert errors[1] < errors[0] / 8
 
 
+@pytest.mark.slow
 def test_passes_of_bounded_size_agree(
     variant: str, field: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -212,6 +216,7 @@ def assert_is_the_closed_form(scene: dict[str, Any]) -> None:
     np.testing.assert_allclose(image, expected.reshape(height, width, 4), atol=2e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1)])
 def test_tiny_films(variant: str, field: Path, size: tuple[int, int]) -> None:
     assert_is_the_closed_form(scene_dict(field, size=size, spp=1))
@@ -253,6 +258,7 @@ def test_environment_shows_behind_the_field(variant: str, field: Path) -> None:
     np.testing.assert_allclose(hidden, alone, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_envmap_is_seen_in_the_direction_of_the_ray(variant: str, field: Path) -> None:
     pixels = np.random.default_rng(0).random((8, 16, 3)).astype(np.float32)
     sky = {"type": "envmap", "bitmap": mi.Bitmap(pixels)}
@@ -310,6 +316,7 @@ def test_occupancy_is_dropped_when_weights_change(variant: str, tmp_path: Path) 
     assert np.array(mi.render(scene))[..., 3].max() > 0.5
 
 
+@pytest.mark.slow
 def test_optimising_a_weight_through_mi_render(variant: str, field: Path) -> None:
     scene = mi.load_dict(scene_dict(field, spp=1))
     target = mi.render(scene, seed=0, spp=16)

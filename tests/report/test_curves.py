@@ -52,6 +52,7 @@ def test_rows_are_all_combinations() -> None:
 # ---- Looking at a run ---------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_looks_take_no_training_time_and_change_nothing(
     blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,6 +103,7 @@ def test_looks_that_a_checkpoint_has_not_seen_are_repeated(tmp_path: Path) -> No
 # ---- The whole ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_models_and_seeds(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows, out = tiny(("network.width", ["8", "12"])), tmp_path / "out"
     options: dict[str, Any] = {"seeds": 2, "views": 2, "looks": 3}
@@ -124,6 +126,7 @@ def test_models_and_seeds(blob: Path, tmp_path: Path, monkeypatch: pytest.Monkey
         training_curves(blob, out, rows, VARIANT, **{**options, "looks": 4})
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was_stopped(
     blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,6 +152,7 @@ def test_it_goes_on_where_it_was_stopped(
     assert [line["step"] for line in record["rows"][0]["runs"][1]["curve"]] == [1, 6]
 
 
+@pytest.mark.slow
 def test_failures_are_counted(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(self: Run, show_bar: bool = True, after_step: Any = None) -> None:
         raise TrainingError("collapsed")
@@ -182,6 +186,7 @@ def test_what_curves_say() -> None:
     assert "1 runs failed" in text
 
 
+@pytest.mark.slow
 def test_the_command(blob: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     options = ["--presets", "nerf", "--vary", "network.width=8,12", "--seeds", "1", "--steps", "3"]

@@ -50,6 +50,7 @@ def test_the_suite(group: str) -> None:
         assert sorted(filter(None, cameras)) == ["hemisphere"] * 6 + ["sphere"] * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_every_scene(name: str) -> None:
     """Parameters, the box, and a picture that covers and shines as it did when it was made."""
@@ -72,6 +73,7 @@ def test_every_scene(name: str) -> None:
     assert np.minimum(luminance, 1).mean() == pytest.approx(LOOKS[name][1], rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", COMPOSED)
 def test_scenes_of_fields(name: str, tmp_path: Path) -> None:
     """Found and rendered by name; in some pixels there is a field, in some there is none."""
@@ -148,6 +150,7 @@ def test_no_asset_lies_idle() -> None:
 SCRIPTS = sorted(p.name for p in ASSETS.glob("*.py"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("script", SCRIPTS)
 def test_scripts_make_the_files_again(script: str, tmp_path: Path) -> None:
     """Texts and headers to the byte, numbers up to what another processor rounds."""
@@ -208,6 +211,7 @@ def test_blob_has_the_stated_integral(tmp_path: Path) -> None:
         assert image[..., channel] == pytest.approx(radiance * image[..., 3], abs=1e-3)
 
 
+@pytest.mark.slow
 def test_fog_has_the_stated_transmittance(tmp_path: Path) -> None:
     """Where a ray meets nothing but fog, alpha is what the fog keeps back."""
     image, depth, o, d = one_view("fog", tmp_path / "data", 512)
@@ -228,6 +232,7 @@ def test_fog_has_the_stated_transmittance(tmp_path: Path) -> None:
     assert abs((found - expected).mean()) < 0.02
 
 
+@pytest.mark.slow
 def test_hdr_spans_four_decades(tmp_path: Path) -> None:
     image, _, _, _ = one_view("hdr", tmp_path / "data", 256, size=64)
     seen = image[..., 3] > 0.99

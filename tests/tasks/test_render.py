@@ -86,6 +86,7 @@ def test_names_in_capitals(blob_run: Path, tmp_path: Path) -> None:
     assert read_png(render(blob_run, tmp_path / "A.PNG")).shape == (24, 24, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "stored"), [((32, 26), (26, 32)), ((33, 27), (28, 34))])
 def test_videos(
     size: tuple[int, int],
@@ -121,6 +122,7 @@ def test_a_folder_with_a_dot_must_exist(blob_run: Path, tmp_path: Path) -> None:
     assert (tmp_path / "v1.2" / "orbit_000.png").is_file()
 
 
+@pytest.mark.slow
 def test_test_views_are_those_of_the_evaluation(blob_run: Path, tmp_path: Path) -> None:
     folder = render(blob_run, tmp_path / "views", "--path", "test")
     files = sorted(folder.iterdir())
@@ -147,6 +149,7 @@ def test_some_test_views(blob_run: Path, tmp_path: Path) -> None:
         assert picture == (every / f"test_{old:03d}.png").read_bytes()
 
 
+@pytest.mark.slow
 def test_size_keeps_the_field_of_view(blob_run: Path, tmp_path: Path) -> None:
     options = ["--path", "test"]
     small = read_exr(render(blob_run, tmp_path / "a.exr", *options))
@@ -157,6 +160,7 @@ def test_size_keeps_the_field_of_view(blob_run: Path, tmp_path: Path) -> None:
     assert wide == pytest.approx(small[6:18], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_spp_averages_over_the_pixel(blob_run: Path, tmp_path: Path) -> None:
     options = ["--path", "test"]
     fine = read_exr(render(blob_run, tmp_path / "a.exr", *options, "--size", 48, 48))
@@ -287,6 +291,7 @@ def test_pixel_formats(aovs: str, pixels: str, scene: Callable[..., Path], tmp_p
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", ["linear", "srgb"])
 def test_mitsuba_sees_what_evaluation_sees(space: str, tmp_path: Path) -> None:
     """One field, one camera, once through ``mi.render`` and once through ``render_view``."""

@@ -96,6 +96,7 @@ def test_without_time_for_probes_it_is_preset_fast(diffuse: Dataset) -> None:
     assert "3 views, too few to hold any back" in str(decisions[-1])
 
 
+@pytest.mark.slow
 def test_the_choice_is_that_of_a_trainer_left_alone(diffuse: Dataset) -> None:
     """Values found are those that a run of preset fast would find for itself."""
     config, _ = decided(start(steps=1), diffuse, llvm)
@@ -250,6 +251,7 @@ def test_what_the_user_sets_is_neither_probed_nor_changed(script: Any) -> None:
 # ---- Probes ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["diffuse", "mirror"])
 def test_directions_are_seen_where_they_matter(
     kind: str, diffuse: Dataset, mirror: Dataset
@@ -292,6 +294,7 @@ def test_views_are_held_back(diffuse: Dataset) -> None:
     assert len(runs) == 4 and not held & others and held | others == set(diffuse.names)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_probes_keep_to_their_share_of_steps(
     diffuse: Dataset, monkeypatch: pytest.MonkeyPatch
@@ -311,6 +314,7 @@ def test_probes_keep_to_their_share_of_steps(
     assert prober(diffuse, replace(config, steps=30)).first(config) is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_probes_keep_to_their_share_of_seconds(
     diffuse: Dataset, monkeypatch: pytest.MonkeyPatch
@@ -332,6 +336,7 @@ def test_probes_keep_to_their_share_of_seconds(
     assert prober(diffuse, replace(config, max_seconds=480.0)).first(config).steps == 16
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_probes_depend_on_the_seed_alone(diffuse: Dataset) -> None:
     """Without a hash grid, whose gradients are summed in the order of threads."""

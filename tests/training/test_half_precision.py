@@ -67,6 +67,7 @@ def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 1000), config=st.sampled_from(CONFIGS))
 def test_derivatives_are_those_of_single_precision(
@@ -81,6 +82,7 @@ def test_derivatives_are_those_of_single_precision(
     assert max(errors.values()) > 0.1 * HALF  # it is half precision
 
 
+@pytest.mark.slow
 def test_small_gradients_need_the_scale(ad: Any) -> None:
     """Adjoints of 1e-8 are less than half precision can hold."""
     expected = gradients(ad, BASE, None, size=1e-9)
@@ -137,6 +139,7 @@ def small(*changes: str) -> TrainConfig:
     )
 
 
+@pytest.mark.slow
 def test_it_learns_as_in_single_precision(ad: Any, views: Dataset) -> None:
     errors = []
     for half in ("true", "false"):
@@ -147,6 +150,7 @@ def test_it_learns_as_in_single_precision(ad: Any, views: Dataset) -> None:
     assert errors[0] < 0.02
 
 
+@pytest.mark.slow
 def test_an_overflow_is_declined_and_answered(ad: Any, views: Dataset) -> None:
     trainer = Trainer(small(), views, ad)
     assert trainer.loss_scale is not None
@@ -158,6 +162,7 @@ def test_an_overflow_is_declined_and_answered(ad: Any, views: Dataset) -> None:
         np.testing.assert_array_equal(weight, before[name])
 
 
+@pytest.mark.slow
 def test_it_goes_on_from_a_checkpoint(ad: Any, views: Dataset, tmp_path: Path) -> None:
     trainer = Trainer(small(), views, ad)
     assert trainer.loss_scale is not None
@@ -169,6 +174,7 @@ def test_it_goes_on_from_a_checkpoint(ad: Any, views: Dataset, tmp_path: Path) -
     np.testing.assert_array_equal(other.loss_scale.state(), [2.0**9, 7])
 
 
+@pytest.mark.slow
 def test_a_checkpoint_without_the_scale_is_refused(ad: Any, views: Dataset, tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "c", Trainer(small("half_precision=false"), views, ad), {})
     with pytest.raises(InputError, match="loss_scale"):

@@ -130,6 +130,7 @@ def test_incomplete_rays_do_not_count(views: Dataset) -> None:
     assert loss[1] == pytest.approx(error[:complete].mean(), rel=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["nerf", "fast"])
 def test_no_kernel_is_compiled_in_a_steady_state(name: str, data: Path, tmp_path: Path) -> None:
     """In a process of its own, whose kernel cache starts empty."""
@@ -169,6 +170,7 @@ print(len(sizes), len(history), sum(not k["cache_hit"] for k in history))
     assert any((tmp_path / ".drjit").iterdir())  # the cache was this one
 
 
+@pytest.mark.slow
 def test_steps_leave_no_arrays_behind(views: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     """Resident memory over 2000 steps is measured by benchmarks/memory.py."""
     trainer = Trainer(small(), views, ad)
@@ -306,6 +308,7 @@ def test_the_log_is_cut_back_to_the_checkpoint(data: Path, tmp_path: Path) -> No
     assert json.loads(log.read_text().splitlines()[-1])["step"] == 8
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_and_the_run_goes_on(data: Path, tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mi_nerf.cli", "train", str(data), "--out"]
     command += [str(tmp_path / "run"), "--steps", "100000", "--set", *SMALL, "report_every=0.1"]
@@ -462,6 +465,7 @@ def test_sample_positions_are_detached(views: Dataset) -> None:
             np.testing.assert_allclose(b[name], gradient, rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_fine_samples_gather_at_the_surface(data: Path, tmp_path: Path) -> None:
     config = small(*FINE, "sampling.batch=2048", "occupancy.enabled=False", steps=300)
     run = training.start(data, tmp_path / "run", config, "llvm_ad_rgb")
@@ -483,6 +487,7 @@ def test_fine_samples_gather_at_the_surface(data: Path, tmp_path: Path) -> None:
     assert (np.array(seen.color[0]) == np.array(again.color[0])).all()  # no chance involved
 
 
+@pytest.mark.slow
 def test_resuming_both_networks_is_exact(data: Path, tmp_path: Path) -> None:
     config = small(*FINE, steps=20)
     through = training.start(data, tmp_path / "a", config, "llvm_ad_rgb")
