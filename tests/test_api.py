@@ -184,6 +184,7 @@ def test_only_training_takes_training_time(
     assert opened < run.seconds < opened + 1
 
 
+@pytest.mark.slow
 def test_a_picture_on_the_way_changes_nothing(blob: Path, tmp_path: Path) -> None:
     test = mi_nerf.load_dataset(blob, "test")
     runs = [mi_nerf.start(blob, tmp_path / n, steps=4, settings=SMALL) for n in "ab"]
@@ -195,6 +196,7 @@ def test_a_picture_on_the_way_changes_nothing(blob: Path, tmp_path: Path) -> Non
         np.testing.assert_array_equal(runs[0].trainer.field.weights()[name], weights)
 
 
+@pytest.mark.slow
 def test_a_picture_is_what_the_evaluation_sees(trained: mi_nerf.Run, tmp_path: Path) -> None:
     record = mi_nerf.evaluate(trained, images=tmp_path / "images")
     test = mi_nerf.load_dataset(data_of(trained), "test")
@@ -213,6 +215,7 @@ def data_of(run: mi_nerf.Run) -> Path:
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_evaluate_takes_runs_folders_and_targets(trained: mi_nerf.Run) -> None:
     targets = [trained, trained.folder, str(trained.folder), mi_nerf.open_target(trained.folder)]
     records = [mi_nerf.evaluate(target, views=2) for target in targets]

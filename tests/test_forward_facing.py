@@ -168,6 +168,7 @@ def test_field_files_keep_the_projection(tmp_path: Path) -> None:
     assert load_field(small_file(tmp_path)).config.ndc is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 2.0])
 def test_mitsuba_sees_what_evaluation_sees(scale: float, tmp_path: Path) -> None:
     """One field, one camera, through ``mi.render`` and ``render_view``; also when moved."""
@@ -265,6 +266,7 @@ def record_data(run: Path) -> str:
     return json.loads((run / "config.json").read_text())["data"]["path"]
 
 
+@pytest.mark.slow
 def test_evaluation_refuses_cameras_of_another_kind(
     forward_run: Path, blob_run: Path, capture: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:

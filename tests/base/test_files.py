@@ -270,6 +270,7 @@ def test_info_on_the_system(info: Any) -> None:
     assert rows["default"].endswith("_ad_rgb")
 
 
+@pytest.mark.slow
 def test_info_on_a_run(info: Any, blob: Path, blob_run: Path) -> None:
     rows = info(blob_run)
     assert rows["run"] == str(blob_run)

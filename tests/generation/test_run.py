@@ -214,6 +214,7 @@ def test_png_is_the_encoded_exr(dataset: tuple[Path, dict[str, Any]]) -> None:
         assert (png[~seen] == 0).all()
 
 
+@pytest.mark.slow
 def test_alpha_is_coverage(dataset: tuple[Path, dict[str, Any]]) -> None:
     """Against the share of 16x16 rays a pixel that meet the ball or the square."""
     folder = dataset[0]

@@ -86,6 +86,7 @@ def test_what_follows_from_the_data(diffuse: Dataset) -> None:
     assert config.background == "white" and config.preset == "auto"
 
 
+@pytest.mark.slow
 def test_without_time_for_probes_it_is_preset_fast(diffuse: Dataset) -> None:
     config, decisions = decided(start(steps=10), diffuse, llvm)
     fast = preset("fast")
@@ -167,6 +168,7 @@ def script(
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("averaged", "flat", "needed"),
     [
@@ -191,6 +193,7 @@ def test_directions_go_only_if_both_tests_say_so(
     assert "30.00" in reason and f"{averaged:.2f}" in reason
 
 
+@pytest.mark.slow
 def test_the_network_grows_while_it_pays(script: Any) -> None:
     answers = {"1x64": probe(30.0), "2x64": probe(30.1, seconds=0.02)}
     config, decisions, asked = script(answers)
@@ -212,6 +215,7 @@ def test_twice_the_time_has_to_bring_more_than_twice_the_steps() -> None:
     assert not worth_growing(probe(30.0), probe(30.01))
 
 
+@pytest.mark.slow
 def test_fourier_features_where_they_learn_more(script: Any) -> None:
     answers = {"1x64": probe(30.0), "fourier": probe(30.2)}
     config, decisions, _ = script(answers)
@@ -225,6 +229,7 @@ def test_fourier_features_where_they_learn_more(script: Any) -> None:
     assert "fourier" in asked and "no time" in str(decisions[-1])
 
 
+@pytest.mark.slow
 def test_nothing_is_decided_without_a_first_probe(script: Any) -> None:
     for first in (None, probe(math.nan, steps=40)):
         config, decisions, asked = script({"1x64": first})
@@ -232,6 +237,7 @@ def test_nothing_is_decided_without_a_first_probe(script: Any) -> None:
         assert "too short for probes" in str(decisions[-1])
 
 
+@pytest.mark.slow
 def test_what_the_user_sets_is_neither_probed_nor_changed(script: Any) -> None:
     answers = {"1x64": probe(30.0, averaged=31.0), "1x64 flat": probe(31.0)}
     answers |= {"1x48": probe(30.0, averaged=30.0), "fourier": probe(29.0)}
@@ -347,6 +353,7 @@ def test_probes_depend_on_the_seed_alone(diffuse: Dataset) -> None:
     assert other.quality != found[0].quality
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_run_goes_on_from_the_best_probe(
     diffuse: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -371,6 +378,7 @@ def test_the_run_goes_on_from_the_best_probe(
 # ---- Runs --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_records_and_shows_its_reasons(
     diffuse: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -390,6 +398,7 @@ def test_a_run_records_and_shows_its_reasons(
         assert line in said and line in shown
 
 
+@pytest.mark.slow
 def test_an_unknown_record_of_reasons_is_passed_over(
     diffuse: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -402,6 +411,7 @@ def test_an_unknown_record_of_reasons_is_passed_over(
         assert "auto:" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_resumed_run_does_not_probe(
     diffuse: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -418,6 +428,7 @@ def test_a_resumed_run_does_not_probe(
     assert (tmp_path / "run/config.json").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_an_interrupted_choice_leaves_nothing(
     diffuse: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

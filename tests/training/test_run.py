@@ -93,6 +93,7 @@ def test_steps_depend_on_the_seed_alone(views: Dataset) -> None:
     assert any(np.abs(runs[2][n] - w).max() > 0 for n, w in runs[0].items())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("background", ["white", "black", "random"])
 def test_backgrounds(views: Dataset, background: str) -> None:
     """An empty field shows the background alone: its error against an even image is known."""
@@ -221,6 +222,7 @@ def test_steps_without_a_whole_ray_end_the_run(data: Path, tmp_path: Path) -> No
         run.train(show_bar=False)
 
 
+@pytest.mark.slow
 def test_a_collapsed_run_restarts_and_says_so(data: Path, tmp_path: Path) -> None:
     config = small(
         "density.activation=relu",
@@ -236,6 +238,7 @@ def test_a_collapsed_run_restarts_and_says_so(data: Path, tmp_path: Path) -> Non
     assert [line["attempt"] for line in log if line.get("event") == "restart"] == [1, 2]
 
 
+@pytest.mark.slow
 def test_a_healthy_run_does_not_restart(data: Path, tmp_path: Path) -> None:
     config = small(steps=210, collapse_check=200)
     run = training.start(data, tmp_path / "run", config, "llvm_ad_rgb")
@@ -327,6 +330,7 @@ def test_ctrl_c_saves_and_the_run_goes_on(data: Path, tmp_path: Path) -> None:
     assert stopped.trainer.step_count == last["step"]
 
 
+@pytest.mark.slow
 def test_max_seconds_counts_from_the_given_start(
     data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -372,6 +376,7 @@ def test_octaves_follow_the_resolution(views: Dataset) -> None:
     assert resolved_octaves(fine, *box) == coarse + 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fine", [0, 16])
 def test_a_step_in_parts_is_the_same_step(views: Dataset, fine: int) -> None:
     """Gradients of parts that fit in memory add up to those of all rays at once."""
@@ -395,6 +400,7 @@ def test_a_step_in_parts_is_the_same_step(views: Dataset, fine: int) -> None:
         np.testing.assert_allclose(found, expected, atol=2e-5 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_the_field_file_takes_the_occupancy_along(data: Path, tmp_path: Path) -> None:
     run = training.start(data, tmp_path / "run", small(steps=80), "llvm_ad_rgb")
     run.train(show_bar=False)
