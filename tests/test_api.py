@@ -16,6 +16,7 @@ import pytest
 import mi_nerf
 from mi_nerf.cli import main
 from mi_nerf.training.run_folder import read_config
+from tests.support.clock import Clock
 
 SMALL = {
     "network.width": 16,
@@ -45,6 +46,7 @@ def test_every_public_name_is_there_and_explained() -> None:
         mi_nerf.qqq  # noqa: B018
 
 
+@pytest.mark.slow
 def test_importing_the_package_imports_no_training() -> None:
     code = "import sys, mi_nerf; print([m for m in sys.modules if m.startswith('mi_nerf.t')])"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
@@ -54,6 +56,7 @@ def test_importing_the_package_imports_no_training() -> None:
     assert found.stdout.split() == ["start", "Run"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", ["mitsuba", "mi_nerf"])
 def test_before_or_after_the_variant_is_set(first: str, blob_run: Path) -> None:
     """And across a switch to a variant without derivatives, and back."""
@@ -92,6 +95,7 @@ def test_the_active_variant_holds(monkeypatch: pytest.MonkeyPatch) -> None:
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_settings_by_name_or_as_text(blob: Path, tmp_path: Path) -> None:
     options = {"downscale": 2, "seed": 3, "steps": 5, "preset": "fast"}
     named = {
@@ -116,6 +120,7 @@ def test_settings_by_name_or_as_text(blob: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "d").exists()
 
 
+@pytest.mark.slow
 def test_reports_are_the_lines_of_the_log(blob: Path, tmp_path: Path) -> None:
     run = mi_nerf.start(blob, tmp_path / "run", steps=6, settings=SMALL)
     reports = list(run.reports())
@@ -128,6 +133,7 @@ def test_reports_are_the_lines_of_the_log(blob: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(run.trainer.field.weights()[name], weights)
 
 
+@pytest.mark.slow
 def test_leaving_the_loop_saves_and_a_further_one_goes_on(blob: Path, tmp_path: Path) -> None:
     through = mi_nerf.start(blob, tmp_path / "through", steps=6, settings=SMALL)
     through.train(show_bar=False)
@@ -146,6 +152,7 @@ def test_leaving_the_loop_saves_and_a_further_one_goes_on(blob: Path, tmp_path: 
         np.testing.assert_array_equal(resumed.trainer.field.weights()[name], weights)
 
 
+@pytest.mark.slow
 def test_an_interrupt_while_the_caller_looks_is_the_callers(blob: Path, tmp_path: Path) -> None:
     """It ends the loop as any other, and leaving the loop saves."""
     run = mi_nerf.start(blob, tmp_path / "run", steps=50, settings=SMALL)
@@ -159,23 +166,27 @@ def test_an_interrupt_while_the_caller_looks_is_the_callers(blob: Path, tmp_path
     assert mi_nerf.start(blob, tmp_path / "run", resume=True).trainer.step_count == 3
 
 
-def test_only_training_takes_training_time(blob: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_only_training_takes_training_time(
+    blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "monotonic", clock := Clock())
     run = mi_nerf.start(blob, tmp_path / "run", steps=3, settings=SMALL)
     opened = run.seconds
     assert opened > 0  # reading the data and carving the hull count
-    time.sleep(0.3)
+    clock.now += 1000
     assert run.seconds == opened
-    began, looked = time.monotonic(), 0.0
+    looks = 0
     for _ in run.reports():
-        seconds, before = run.seconds, time.monotonic()
-        time.sleep(0.3)
+        seconds = run.seconds
+        clock.now += 1000
         assert run.seconds == seconds
-        looked += time.monotonic() - before
-    wall = time.monotonic() - began
-    assert looked > 0.9
-    assert run.seconds - opened == pytest.approx(wall - looked, abs=0.1)
+        looks += 1
+    assert looks == 3
+    assert opened < run.seconds < opened + 1
 
 
+@pytest.mark.slow
 def test_a_picture_on_the_way_changes_nothing(blob: Path, tmp_path: Path) -> None:
     test = mi_nerf.load_dataset(blob, "test")
     runs = [mi_nerf.start(blob, tmp_path / n, steps=4, settings=SMALL) for n in "ab"]
@@ -187,6 +198,7 @@ def test_a_picture_on_the_way_changes_nothing(blob: Path, tmp_path: Path) -> Non
         np.testing.assert_array_equal(runs[0].trainer.field.weights()[name], weights)
 
 
+@pytest.mark.slow
 def test_a_picture_is_what_the_evaluation_sees(trained: mi_nerf.Run, tmp_path: Path) -> None:
     record = mi_nerf.evaluate(trained, images=tmp_path / "images")
     test = mi_nerf.load_dataset(data_of(trained), "test")
@@ -205,6 +217,7 @@ def data_of(run: mi_nerf.Run) -> Path:
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_evaluate_takes_runs_folders_and_targets(trained: mi_nerf.Run) -> None:
     targets = [trained, trained.folder, str(trained.folder), mi_nerf.open_target(trained.folder)]
     records = [mi_nerf.evaluate(target, views=2) for target in targets]

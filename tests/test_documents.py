@@ -131,6 +131,7 @@ def is_placeholder(text: str) -> bool:
     return bool(re.fullmatch(r"[A-Z]+|…|value|key", text))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("line", list(commands()))
 def test_commands_are_accepted(line: str) -> None:
     words = shlex.split(line)
@@ -264,6 +265,7 @@ XML = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("text", PYTHON)
 def test_python_examples_run(text: str, workplace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if "llvm_ad_rgb" not in mi_nerf.available_variants():

@@ -180,6 +180,7 @@ def test_field_files_keep_the_projection(tmp_path: Path) -> None:
     assert load_field(small_file(tmp_path)).config.ndc is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 2.0])
 def test_mitsuba_sees_what_evaluation_sees(scale: float, tmp_path: Path) -> None:
     """One field, one camera, through ``mi.render`` and ``render_view``; also when moved."""
@@ -259,6 +260,7 @@ def test_silhouettes_do_not_carve_projected_boxes(capture: Path) -> None:
     assert hull.tighten(transparent, *dataset.box) == dataset.box
 
 
+@pytest.mark.slow
 def test_training_learns_the_capture(forward_run: Path, tmp_path: Path) -> None:
     """Held-out views come out better than any one colour, in files that XML scenes load."""
     file = tmp_path / "result.json"
@@ -275,6 +277,7 @@ def record_data(run: Path) -> str:
     return json.loads((run / "config.json").read_text())["data"]["path"]
 
 
+@pytest.mark.slow
 def test_evaluation_refuses_cameras_of_another_kind(
     forward_run: Path, blob_run: Path, capture: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:
@@ -313,6 +316,7 @@ def test_spiral_is_the_path_of_forward_runs(
     assert "expected --path spiral or --path test" in message
 
 
+@pytest.mark.slow
 def test_report_of_a_capture(
     forward_run: Path, capture: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:

@@ -267,6 +267,7 @@ def test_a_failing_write_leaves_the_old_field(tmp_path: Path) -> None:
     assert names(tmp_path) == {"field.safetensors"}
 
 
+@pytest.mark.slow
 def test_nothing_in_a_run_is_half_written_or_pickled(blob_run: Path) -> None:
     assert names(blob_run) == {
         "config.json",
@@ -311,6 +312,7 @@ def test_info_on_the_system(info: Any) -> None:
     assert rows["default"].endswith("_ad_rgb")
 
 
+@pytest.mark.slow
 def test_info_on_a_run(info: Any, blob: Path, blob_run: Path) -> None:
     rows = info(blob_run)
     assert rows["run"] == str(blob_run)

@@ -45,6 +45,7 @@ ndcs = st.builds(Ndc, st.floats(0.3, 5), st.floats(0.3, 5), st.floats(0.1, 3))
 # ---- The matrix --------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(ndcs)
 def test_the_matrix_carries_the_frustum_into_the_cube(ndc: Ndc) -> None:
     """Corners of the near plane, and points far away along the edges of the frustum."""
@@ -64,6 +65,7 @@ def test_opengl_matrix_in_the_limit() -> None:
 # ---- Rays --------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("precision", ["32", "64"])
 @given(ndc=ndcs, seed=st.integers(0, 1 << 16))
 def test_projected_points_lie_on_the_projected_ray(
@@ -84,6 +86,7 @@ def test_projected_points_lie_on_the_projected_ray(
         assert (np.abs(found - expected).max(axis=1) < TOLERANCE[precision] * size * 10).all()
 
 
+@pytest.mark.slow
 @given(ndc=ndcs, seed=st.integers(0, 1 << 16))
 def test_origin_direction_and_parameter_by_the_paper(ad: Any, ndc: Ndc, seed: int) -> None:
     """The formulas of appendix C written out, with the origin on the near plane."""
@@ -106,6 +109,7 @@ def test_origin_direction_and_parameter_by_the_paper(ad: Any, ndc: Ndc, seed: in
         assert np.allclose(s / length, parameter, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 @given(ndc=ndcs, seed=st.integers(0, 1 << 16))
 def test_end_points(ad: Any, ndc: Ndc, seed: int) -> None:
     """t' = 0 and z' = −1 at the near plane; t' = 1 and z' = 1 at infinity."""

@@ -62,6 +62,7 @@ def random_pixels(intrinsics: Intrinsics, n: int, seed: int = 0) -> tuple[np.nda
 PAIRS = [("opengl", "opencv"), ("opengl", "mitsuba"), ("opencv", "mitsuba")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("a", "b"), PAIRS + [(b, a) for a, b in PAIRS])
 @given(pose=rigid_poses())
 def test_conversions_round_trip(a: str, b: str, pose: np.ndarray) -> None:

@@ -84,6 +84,7 @@ def test_help_lists_the_commands(arguments: list[str], capsys: pytest.CaptureFix
     assert "Examples:" not in text  # those of one command alone
 
 
+@pytest.mark.slow
 def test_every_example_is_accepted_by_the_parser(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -404,6 +405,7 @@ def test_resume_with_other_settings(options: str, refused: Refused, blob: Path, 
     assert f"{run}: a resumed run keeps its settings" in message
 
 
+@pytest.mark.slow
 def test_resume_with_the_same_settings(blob: Path, run: Path) -> None:
     options = ["--resume", "--steps", "21", "--set", "network.width=16"]
     assert main(["train", str(blob), "--out", str(run), *options]) == 0
@@ -485,6 +487,7 @@ RUN_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RUN_DAMAGES)
 def test_resume_of_a_bad_run(name: str, refused: Refused, blob: Path, run: Path) -> None:
     damage, said = RUN_DAMAGES[name]
@@ -665,6 +668,7 @@ def call(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(words, capture_output=True, text=True, cwd=folder, timeout=60)
 
 
+@pytest.mark.slow
 def test_a_refusing_process(blob_run: Path, tmp_path: Path) -> None:
     """Nothing that Mitsuba, Dr.Jit or Python say themselves gets in between."""
     scene = tmp_path / "scene.xml"
@@ -677,6 +681,7 @@ def test_a_refusing_process(blob_run: Path, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_a_succeeding_process(blob_run: Path, tmp_path: Path) -> None:
     result = call("eval", blob_run, "--views", "1", "--json", tmp_path / "x.json")
     assert (result.returncode, result.stderr) == (0, "")  # no bar in a log

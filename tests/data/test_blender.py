@@ -226,6 +226,7 @@ def test_available_splits(tmp_path: Path) -> None:
 # ---- Downscaling ---------------------------------------------------------------
 
 
+@pytest.mark.slow
 @given(
     image=arrays(
         np.float32,

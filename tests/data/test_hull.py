@@ -97,6 +97,7 @@ def test_nothing_opaque_is_carved(
     assert mask[x, y, z].all()
 
 
+@pytest.mark.slow
 def test_cells_at_the_edge_of_a_wide_picture_reach_far() -> None:
     """Perspective stretches what lies away from the axis: a cell's corners must not get lost."""
     rng = np.random.default_rng(2)

@@ -42,6 +42,7 @@ def denser(values: dict[str, Any], factor: float) -> dict[str, Any]:
 # ---- Against closed forms ---------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dense", [1e-5, 1, 30, 1000])
 @every_case
 def test_the_error_is_at_most_the_stated_one(
@@ -56,6 +57,7 @@ def test_the_error_is_at_most_the_stated_one(
     assert np.median(found.error[:, :4]) < 1e-3 and np.median(found.error[:, 4]) < 2e-2
 
 
+@pytest.mark.slow
 @every_case
 def test_far_better_than_quadrature(ad: Any, kind: str, values: dict[str, Any]) -> None:
     """By single precision, where rounding is all that remains on smooth fields."""
@@ -130,6 +132,7 @@ def test_a_better_tolerance_takes_more_intervals(ad: Any) -> None:
 # ---- Other fields and rays ----------------------------------------------------
 
 
+@pytest.mark.slow
 def test_learned_field(ad: Any) -> None:
     """Against the same weights in double precision, marched very finely."""
     o, d = (v.astype(np.float32) for v in directed(24))
@@ -168,6 +171,7 @@ def test_normalised_device_coordinates(ad: Any) -> None:
     assert found.error[1:].max() < 1e-4
 
 
+@pytest.mark.slow
 def test_bounds_and_blocks(ad: Any) -> None:
     """Numbers, arrays and none; results do not depend on how the work is divided."""
     field = closed_form("slab", {"density": 2.0}, ad.TensorXf)

@@ -87,6 +87,7 @@ def test_means_of_closed_forms(ad: Any, kind: str, values: dict[str, Any]) -> No
     assert (found[:, 3] == 0).all()  # the ray that misses the box
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["slab", "step", "gaussian", "shell"])
 def test_majorants_below_the_density(ad: Any, kind: str) -> None:
     """Half to a third of it: transmittances change their sign, means stay right.
@@ -121,6 +122,7 @@ def test_second_moment_of_the_transmittance(ad: Any) -> None:
     assert np.mean(through**2) == pytest.approx(np.exp(0.75), abs=4 * error)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [16, 72])
 def test_learned_field_agrees_with_the_reference(ad: Any, width: int) -> None:
     """Narrow networks are asked in one kernel, wide ones in padded blocks."""
@@ -135,6 +137,7 @@ def test_learned_field_agrees_with_the_reference(ad: Any, width: int) -> None:
     assert 0 < seen.queries / found[0].size < 20
 
 
+@pytest.mark.slow
 def test_normalised_device_coordinates(ad: Any) -> None:
     rng = np.random.default_rng(0)
     o = rng.uniform(-0.2, 0.2, (6, 3))
@@ -149,6 +152,7 @@ def test_normalised_device_coordinates(ad: Any) -> None:
     check_z(z_scores(found, np.column_stack([exact.color, exact.opacity])))
 
 
+@pytest.mark.slow
 def test_more_rays_than_slots(ad: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Rays start as others end; each sees the same as if all were under way at once."""
     field = closed_form("gaussian", VALUES["gaussian"], ad.TensorXf)
@@ -279,6 +283,7 @@ def batches(scene: dict[str, Any], integrator: dict[str, Any], count: int, spp: 
     return np.array([np.array(mi.render(loaded, seed=s, spp=spp)) for s in range(count)], float)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{}, {"majorant": 2.0}])
 @pytest.mark.parametrize("color_space", ["linear", "srgb"])
 def test_images_agree_with_quadrature(
@@ -297,6 +302,7 @@ def test_images_agree_with_quadrature(
     assert tracked[..., 3] == pytest.approx(tracked[..., 4], abs=1e-5)
 
 
+@pytest.mark.slow
 def test_from_xml_through_the_near_and_far(variant: str) -> None:
     """The blob of another test, cut in half by the integrator."""
     text = BLOB.replace(
@@ -313,6 +319,7 @@ def test_from_xml_through_the_near_and_far(variant: str) -> None:
     assert np.abs(whole[0, 0]).max() < 0.02
 
 
+@pytest.mark.slow
 def test_moved_cubes_and_seeds(variant: str, tmp_path: Path) -> None:
     """Distances scale with the cube, densities are the field's own."""
     file = small_file(tmp_path, color_space="linear")
@@ -341,6 +348,7 @@ def test_bad_majorants(variant: str, majorant: float) -> None:
         mi.load_dict({"type": "nerf_tracking", "majorant": majorant})
 
 
+@pytest.mark.slow
 def test_what_there_is_not(variant: str, tmp_path: Path) -> None:
     with pytest.raises(RuntimeError, match="nerf_tracking: aov 'depth' is unknown, expected opac"):
         mi.load_dict({"type": "nerf_tracking", "aovs": "depth"})

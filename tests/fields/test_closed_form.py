@@ -81,6 +81,7 @@ def case(values: dict[str, Any], kind: str, count: int = 12) -> tuple[Any, oracl
 # ---- The oracle itself ------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dense", [1e-6, 1, 30])
 @every_kind
 def test_oracle_against_a_march(kind: str, dense: float) -> None:
@@ -134,6 +135,7 @@ def test_oracle_of_a_gaussian() -> None:
     assert oracle.seen("gaussian", v, rays)[:, 3] == pytest.approx(-np.expm1(-tau), rel=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "values"), [*VALUES.items(), *JUMPS.items()], ids=[*VALUES, *map("{}-0".format, JUMPS)]
 )
@@ -193,6 +195,7 @@ RANDOM = {
 }
 
 
+@pytest.mark.slow
 @settings(derandomize=True, max_examples=50)
 @given(data=st.data(), seed=st.integers(0, 999))
 @every_kind
@@ -273,6 +276,7 @@ def quadrature_errors(
     return np.array([error[:3].max(), error[3], error[4]])
 
 
+@pytest.mark.slow
 @every_kind
 def test_quadrature_converges_with_the_square_of_the_step(ad: Any, kind: str) -> None:
     """Radiance, opacity, depth; a constant density is integrated without error."""
@@ -286,6 +290,7 @@ def test_quadrature_converges_with_the_square_of_the_step(ad: Any, kind: str) ->
         assert fine[:2].max() < 1e-4 and order == pytest.approx(2, abs=0.3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", JUMPS)
 def test_jumps_converge_with_the_step(ad: Any, kind: str) -> None:
     """The interval that holds the jump has an error of its length."""
@@ -310,6 +315,7 @@ def gradient(ad: Any, field: ClosedFormField, mix: np.ndarray, samples: int) -> 
     return np.concatenate([np.array(dr.grad(tensor)) for tensor in field.parameters().values()])
 
 
+@pytest.mark.slow
 @every_kind
 def test_gradients_of_the_quadrature(ad: Any, kind: str) -> None:
     """Every number's; they converge with the step where the slope of the density jumps."""
@@ -453,6 +459,7 @@ BLOB = """<scene version="3.0.0"><integrator type="nerf"/>
         </medium></shape></scene>"""
 
 
+@pytest.mark.slow
 def test_from_xml() -> None:
     mi.set_variant(VARIANT)
     scene = mi.load_string(BLOB)

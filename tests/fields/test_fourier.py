@@ -109,6 +109,7 @@ def test_settings_are_validated(change: dict[str, Any], named: str) -> None:
         FourierEncoding(**change)
 
 
+@pytest.mark.slow
 @given(values=st.lists(st.floats(width=32, allow_nan=False), min_size=12, max_size=12))
 def test_stack_rows(ad: Any, values: list[float]) -> None:
     rows = np.array(values, np.float32).reshape(3, 4)

@@ -31,6 +31,7 @@ BASE = NeuralFieldConfig(
 GRID = HashGridConfig(levels=3, features=2, log2_entries=8, coarsest=4, finest=16)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [

@@ -86,6 +86,7 @@ def evaluate(ad: Any, config: HashGridConfig, numbers: np.ndarray, p: np.ndarray
     return np.stack([np.array(f) for f in found])
 
 
+@pytest.mark.slow
 @settings(max_examples=12)
 @given(
     seed=st.integers(0, 2**31),
@@ -112,6 +113,7 @@ def test_the_reference_knows_vertices(ad: Any) -> None:
     np.testing.assert_allclose(evaluate(ad, config, numbers, p)[:, 0], expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_are_the_interpolation_weights(ad: Any) -> None:
     """The features are linear in the table: each gradient entry against a difference."""
     p = np.random.default_rng(1).uniform(-1, 1, (6, 3)).astype(np.float32)

@@ -150,6 +150,7 @@ def test_one_query(ad: Any) -> None:
 # ---- Initial weights --------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
 def test_initial_activations_neither_die_nor_grow(seed: int) -> None:
     """Through 8 × 256 ReLU layers, as seen from points of the whole box."""

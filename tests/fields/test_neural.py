@@ -195,6 +195,7 @@ def test_published_parameter_count() -> None:
     assert NeuralFieldConfig().parameter_count() == 595_844
 
 
+@pytest.mark.slow
 def test_parameters_are_live(ad: Any) -> None:
     """An optimiser may write into a tensor or put another in its place."""
     p, d = queries(3)
@@ -281,6 +282,7 @@ def test_density_noise_is_standard_normal(ad: Any) -> None:
     assert (again == noise).all()
 
 
+@pytest.mark.slow
 def test_density_noise_acts_before_the_activation(ad: Any) -> None:
     config = NeuralFieldConfig(network=NetworkConfig(depth=1, width=8, skip=-1, view_width=8))
     field = NeuralField.create(config, 0, ad.TensorXf)

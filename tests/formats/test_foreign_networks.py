@@ -212,6 +212,7 @@ def test_same_density_and_colour(
     compare(ad, import_network(path, ImportSettings()), forward, state)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     depth=st.integers(1, 6),
@@ -242,6 +243,7 @@ def test_any_original_architecture(
     same_values(ad, contents, original_forward, state)
 
 
+@pytest.mark.slow
 @settings(max_examples=15)
 @given(
     layers=st.integers(2, 6),
@@ -395,6 +397,7 @@ def test_empty_space_is_found(tmp_path: Path) -> None:
     assert cells[9:].all() and not cells[:6].any()  # 0.75 and more; up to 0
 
 
+@pytest.mark.slow
 def test_renders_in_mitsuba(checkpoint: Path) -> None:
     import mitsuba as mi
 

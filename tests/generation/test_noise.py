@@ -31,6 +31,7 @@ def true_errors(image: np.ndarray, truth: np.ndarray) -> tuple[float, float, flo
     )
 
 
+@pytest.mark.slow
 @given(
     st.integers(0, 1000),
     st.sampled_from([(1, 1), (8, 8), (3, 4), (1, 15)]),

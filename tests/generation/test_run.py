@@ -107,6 +107,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, A
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_splits_and_cameras(dataset: tuple[Path, dict[str, Any]]) -> None:
     folder, record = dataset
     assert record["complete"] and record == json.loads((folder / "dataset.json").read_text())
@@ -128,6 +129,7 @@ def test_splits_and_cameras(dataset: tuple[Path, dict[str, Any]]) -> None:
     assert record["scene"]["box"] == meta["aabb"]
 
 
+@pytest.mark.slow
 def test_readers_of_the_original_format(dataset: tuple[Path, dict[str, Any]]) -> None:
     """As the loader of the paper's code does it: every split, names plus .png, 8 bits."""
     folder = dataset[0]
@@ -141,6 +143,7 @@ def test_readers_of_the_original_format(dataset: tuple[Path, dict[str, Any]]) ->
             assert np.array(frame["transform_matrix"]).shape == (4, 4)
 
 
+@pytest.mark.slow
 def test_depth_and_normals_by_closed_form(dataset: tuple[Path, dict[str, Any]]) -> None:
     folder = dataset[0]
     for i, frame in enumerate(frames(folder)):
@@ -195,6 +198,7 @@ def test_depth_agrees_between_views(tmp_path: Path) -> None:
     assert compared > 2000
 
 
+@pytest.mark.slow
 def test_png_is_the_encoded_exr(dataset: tuple[Path, dict[str, Any]]) -> None:
     folder = dataset[0]
     for i in range(3):
@@ -210,6 +214,7 @@ def test_png_is_the_encoded_exr(dataset: tuple[Path, dict[str, Any]]) -> None:
         assert (png[~seen] == 0).all()
 
 
+@pytest.mark.slow
 def test_alpha_is_coverage(dataset: tuple[Path, dict[str, Any]]) -> None:
     """Against the share of 16x16 rays a pixel that meet the ball or the square."""
     folder = dataset[0]
@@ -234,6 +239,7 @@ def test_alpha_is_coverage(dataset: tuple[Path, dict[str, Any]]) -> None:
         assert np.abs(alpha - coverage)[partial].mean() < 0.02
 
 
+@pytest.mark.slow
 def test_radiance_is_that_of_a_plain_rendering(
     dataset: tuple[Path, dict[str, Any]], tmp_path: Path
 ) -> None:
@@ -270,6 +276,7 @@ def test_radiance_is_that_of_a_plain_rendering(
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
     scene = ball(tmp_path)
     make(scene, tmp_path / "a")
@@ -281,6 +288,7 @@ def test_the_same_seed_gives_the_same_bytes(tmp_path: Path) -> None:
         assert other[name] != data, name
 
 
+@pytest.mark.slow
 def test_more_views_begin_with_the_same_ones(tmp_path: Path) -> None:
     scene = ball(tmp_path)
     make(scene, tmp_path / "few")
@@ -291,6 +299,7 @@ def test_more_views_begin_with_the_same_ones(tmp_path: Path) -> None:
     assert all(few[name] == many[name] for name in pictures)
 
 
+@pytest.mark.slow
 def test_resume_goes_on_and_repairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = ball(tmp_path)
     make(scene, tmp_path / "whole")
@@ -326,6 +335,7 @@ def test_resume_goes_on_and_repairs(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert len(traced) == 7 and contents(out) == whole
 
 
+@pytest.mark.slow
 def test_resume_refuses_another_dataset(tmp_path: Path) -> None:
     scene = ball(tmp_path)
     out = tmp_path / "data"
@@ -346,6 +356,7 @@ def test_resume_refuses_another_dataset(tmp_path: Path) -> None:
     assert contents(out) == before
 
 
+@pytest.mark.slow
 def test_ctrl_c_of_the_command(tmp_path: Path) -> None:
     """A real process: 130, a hint, and what is there is whole."""
     scene, out = ball(tmp_path), tmp_path / "data"
@@ -367,11 +378,13 @@ def test_ctrl_c_of_the_command(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.slow
 def test_a_full_disk(tmp_path: Path) -> None:
     """Files may not grow beyond a few kilobytes: one line, nothing half-written."""
     scene, out = ball(tmp_path), tmp_path / "data"
     rest = ["--train", "2", "--size", "100", "100", "--spp", "4"]
-    # Dr.Jit writes compiled kernels to files too: the same process compiles them before.
+    # Dr.Jit writes compiled kernels to files too: the same process compiles them before. What
+    # is left depends on how memory happens to lie, and Dr.Jit says so in lines of its own.
     script = f"""
 import resource, sys
 from mi_nerf.cli import main
@@ -383,8 +396,8 @@ sys.exit(generate({str(out)!r}))
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
-    assert done.stderr.startswith("mi-nerf: ") and done.stderr.count("\n") == 1
-    assert "cannot be written" in done.stderr
+    lines = [v for v in done.stderr.splitlines() if not v.startswith("jit_kernel_write(): ")]
+    assert len(lines) == 1 and lines[0].startswith("mi-nerf: ") and "cannot be written" in lines[0]
     files = [p for p in out.rglob("*") if p.is_file()]
     assert not [p.name for p in files if p.name.startswith(".")]
     for picture in (p for p in files if p.suffix == ".png"):
@@ -392,6 +405,7 @@ sys.exit(generate({str(out)!r}))
     assert not json.loads((out / "dataset.json").read_text())["views"]
 
 
+@pytest.mark.slow
 def test_no_kernel_is_compiled_after_the_first_view(tmp_path: Path) -> None:
     """In a process of its own, whose kernel cache starts empty."""
     script = f"""
@@ -434,6 +448,7 @@ SENSOR_Y_UP = """<sensor type="perspective"><float name="fov" value="60"/>
 </sensor>"""
 
 
+@pytest.mark.slow
 def test_a_large_scene_elsewhere(tmp_path: Path) -> None:
     """The cameras move out in proportion, around the middle of what is visible."""
     scene = ball(
@@ -454,6 +469,7 @@ def test_a_large_scene_elsewhere(tmp_path: Path) -> None:
     assert exr(tmp_path / "told/train/r_0_depth.exr").max() == pytest.approx(60, abs=21)
 
 
+@pytest.mark.slow
 def test_the_sensor_says_what_is_up(tmp_path: Path) -> None:
     scene = ball(tmp_path, SENSOR_Y_UP)
     record = make(scene, tmp_path / "data", small(spp=None))
@@ -462,6 +478,7 @@ def test_the_sensor_says_what_is_up(tmp_path: Path) -> None:
     assert (poses[:, 1, 3] > 0).all() and (poses[:, 1, 1] > 0).all()
 
 
+@pytest.mark.slow
 def test_parameters_of_the_scene(tmp_path: Path) -> None:
     scene = ball(tmp_path)
     plain = make(scene, tmp_path / "plain")
@@ -472,6 +489,7 @@ def test_parameters_of_the_scene(tmp_path: Path) -> None:
     assert alpha[1] < alpha[0]
 
 
+@pytest.mark.slow
 def test_the_hash_covers_files_that_the_scene_names(tmp_path: Path) -> None:
     texture = tmp_path / "texture.png"
     iio.imwrite(texture, np.full((4, 4, 3), 99, np.uint8))
@@ -489,6 +507,7 @@ def test_the_hash_covers_files_that_the_scene_names(tmp_path: Path) -> None:
     assert make(moved / "ball.xml", tmp_path / "d")["scene"]["sha256"] != first
 
 
+@pytest.mark.slow
 def test_forward_captures(tmp_path: Path) -> None:
     """Against the formulas by which readers of LLFF turn its rows into cameras."""
     sensor = SENSOR_Y_UP.replace("stratified", "independent")
@@ -529,6 +548,7 @@ def test_forward_captures(tmp_path: Path) -> None:
     assert np.ptp(offset[:, 0]) > spread
 
 
+@pytest.mark.slow
 def test_forward_without_a_sensor(tmp_path: Path) -> None:
     record = make(ball(tmp_path), tmp_path / "data", small(protocol="forward", val=0))
     assert record["settings"]["camera_angle_x"] == pytest.approx(CAMERA)
@@ -536,6 +556,7 @@ def test_forward_without_a_sensor(tmp_path: Path) -> None:
     assert exr(tmp_path / "data/train/r_0_depth.exr").max() > 0
 
 
+@pytest.mark.slow
 def test_forward_cameras_move_as_told(tmp_path: Path) -> None:
     scene = ball(tmp_path, **{"<integrator": '<default name="spread" value="0.3"/><integrator'})
     for radius, expected in ((None, 0.3), (0.1, 0.1)):
@@ -555,6 +576,7 @@ def test_passes_split_the_samples() -> None:
         assert max(parts) == 1 or max(parts) * pixels <= 2 * (1 << 24)
 
 
+@pytest.mark.slow
 def test_many_passes_are_one_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Split into parts of very few samples, the noise and its estimate stay what they are."""
     scene = ball(tmp_path)
@@ -599,6 +621,7 @@ def test_bad_options(
     assert message in refused("generate", scene, tmp_path / "out", *small, *options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -664,6 +687,7 @@ def test_folders_in_use(refused: Callable[..., str], tmp_path: Path) -> None:
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "data"
     arguments = ["--train", "2", "--val", "0", "--test", "1", "--size", "24", "24", "--spp", "4"]

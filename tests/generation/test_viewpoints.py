@@ -14,6 +14,7 @@ axes = st.sampled_from(AXES)
 numbers = st.floats(-5, 5)
 
 
+@pytest.mark.slow
 @given(
     st.integers(1, 40),
     st.sampled_from(["train", "val", "test"]),

@@ -21,7 +21,7 @@ def main() -> None:
         head = f"| {case.row} | {case.name} | {case.naive} "
         for finding in case.measure(ad):
             print(
-                f"{head}| {finding.what} | {_number(finding.naive)} | {_number(finding.ours)} "
+                f"{head}| {finding.what} | {number(finding.naive)} | {number(finding.ours)} "
                 f"| `{case.test}` |"
             )
             head = "| | | "
@@ -32,7 +32,8 @@ def main() -> None:
         print(f"| {thickness:g} | {' | '.join(errors)} |")
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
+    """As the tables print it."""
     if not math.isfinite(value):
         return "NaN" if math.isnan(value) else "∞" if value > 0 else "−∞"
     return "0" if value == 0 else f"{value:.3g}"

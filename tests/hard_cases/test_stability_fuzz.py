@@ -12,6 +12,7 @@ from typing import Any
 
 import drjit as dr
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -139,6 +140,7 @@ def test_energy_is_never_created(ad: Any, medium: Medium, count: int, jitter: bo
     assert (found[4] <= far * (1 + 3e-5)).all()
 
 
+@pytest.mark.slow
 @common
 @given(medium=media, count=counts, jitter=flags)
 def test_gradients_are_finite(ad: Any, medium: Medium, count: int, jitter: bool) -> None:
@@ -151,6 +153,7 @@ def test_gradients_are_finite(ad: Any, medium: Medium, count: int, jitter: bool)
         np.testing.assert_allclose(np.array(dr.grad(channel)), weights, rtol=1e-6)
 
 
+@pytest.mark.slow
 @common
 @given(medium=media, count=counts, power=st.integers(-10, 13))
 def test_the_unit_of_the_scene_changes_nothing(
@@ -163,6 +166,7 @@ def test_the_unit_of_the_scene_changes_nothing(
     np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.slow
 @common
 @given(medium=media, count=counts, factor=st.floats(1, 1e6))
 def test_denser_media_are_not_less_opaque(

@@ -58,6 +58,7 @@ def test_psnr_of_identical_images_is_infinite() -> None:
     assert psnr(a, a) == math.inf
 
 
+@pytest.mark.slow
 def test_psnr_agrees_with_scikit_image() -> None:
     from skimage.metrics import peak_signal_noise_ratio
 

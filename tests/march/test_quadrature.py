@@ -76,6 +76,7 @@ densities = st.lists(st.just(-math.inf) | exponent, min_size=64, max_size=64)
 widths = st.lists(st.sampled_from([0.0, 1e-6, 0.01, 0.3, 10.0]), min_size=64, max_size=64)
 
 
+@pytest.mark.slow
 @given(exponents=densities, widths=widths)
 def test_any_medium(ad: Any, exponents: list[float], widths: list[float]) -> None:
     """Densities of 0 and 1e-12 to 1e12 in any order, intervals of any length."""

@@ -84,6 +84,7 @@ def by_blocks(ad: Any, block: int, keep: bool) -> Callable[[NeuralField, Samples
 # ---- Reverse mode -----------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_backward_against_finite_differences(ad: Any) -> None:
     """For every tensor, along a random direction."""
     found, field = gradients(ad, by_blocks(ad, 16, keep=False))
@@ -101,6 +102,7 @@ def test_backward_against_finite_differences(ad: Any) -> None:
         assert np.sum(found[name] * way) == pytest.approx(numeric, rel=1e-5, abs=1e-7), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keep", [True, False])
 @pytest.mark.parametrize("block", [1, 16, 1000])
 def test_blocks_and_stored_activations_make_no_difference(ad: Any, block: int, keep: bool) -> None:
@@ -224,6 +226,7 @@ def test_nothing_is_recorded_unless_asked(ad: Any) -> None:
 # ---- Budget -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_truncate(ad: Any) -> None:
     """Rays that are said to be complete look as if nothing had been cut; the next does not."""
     field = NeuralField.create(CONFIG, 1, ad.TensorXf)

@@ -166,6 +166,7 @@ def test_bounds_of_single_rays(ad: Any) -> None:
 # ---- The same however the work is divided -----------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("chunk", [1, 8, 25, 10_000])
 def test_chunks(ad: Any, chunk: int) -> None:
     """One ray at a time, several, or all; also where the last chunk is a smaller one."""
@@ -380,6 +381,7 @@ def test_rounds_change_nothing_of_what_is_seen(
 # ---- Hidden samples ---------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_hidden_samples_are_left_out(ad: Any) -> None:
     """Behind an optical depth that the grid has seen everywhere, nothing is asked."""
     field = AnalyticField(ball(0.8, 60.0))

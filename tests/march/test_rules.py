@@ -93,6 +93,7 @@ exponents = st.lists(
 )
 
 
+@pytest.mark.slow
 @given(exponents=exponents, seed=st.integers(0, 99), scale=st.sampled_from([1e-3, 1.0, 1e4]))
 def test_any_medium(ad: Any, exponents: list[float], seed: int, scale: float) -> None:
     """Densities of 0 and 1e-12 to 1e12 in any order, samples anywhere, scenes of any size."""
@@ -281,6 +282,7 @@ def order(ad: Any, *case: Any, jitter: bool = False) -> tuple[float, float]:
     return math.log(coarse / fine) / math.log(8), coarse
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SMOOTH)
 def test_linear_density_is_of_second_order_too_and_no_better(ad: Any, kind: str) -> None:
     """The error of a polygon through the samples is twice that of steps, of opposite sign."""
@@ -292,6 +294,7 @@ def test_linear_density_is_of_second_order_too_and_no_better(ad: Any, kind: str)
     assert error["constant"] < error["linear"] < 4 * error["constant"]
 
 
+@pytest.mark.slow
 @every_rule
 @pytest.mark.parametrize("kind", JUMPS)
 def test_jumps_converge_with_the_step(ad: Any, kind: str, rule: str) -> None:
@@ -299,6 +302,7 @@ def test_jumps_converge_with_the_step(ad: Any, kind: str, rule: str) -> None:
     assert slope == pytest.approx(1, abs=0.4) and error < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", SMOOTH)
 def test_jittered_samples(ad: Any, kind: str) -> None:
     """Strata that are taken for their samples converge with step^1.5, cells with step²."""
@@ -344,6 +348,7 @@ def test_rays_that_end_early(ad: Any, rule: str) -> None:
 # ---- Where rules are chosen ---------------------------------------------------
 
 
+@pytest.mark.slow
 def test_refined_samples_keep_the_rule(ad: Any) -> None:
     field = closed_form("gaussian", {}, ad.TensorXf)
     o, d = vectors(ad, [(0, 0, -3)]), vectors(ad, [(0, 0, 1)])
@@ -375,6 +380,7 @@ def test_widths_are_those_between_the_ends(rule: str, fine: int) -> None:
     assert equal == (rule == "constant" and not fine)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ["cells", "linear"])
 def test_training(blob: Path, rule: str) -> None:
     """The loss of a step is that of the rule; a small field learns."""
@@ -399,6 +405,7 @@ def test_field_files_remember_the_rule(tmp_path: Path) -> None:
     assert load_field(path).march.rule == "linear"
 
 
+@pytest.mark.slow
 def test_the_rule_of_a_scene(tmp_path: Path) -> None:
     """The integrator's, or else the file's; an image of each differs from the others."""
     mi.set_variant(VARIANT)

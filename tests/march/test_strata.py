@@ -68,6 +68,7 @@ def test_named_rays(ad: Any, o: Any, d: Any, expected: Any) -> None:
     assert (near[0], far[0]) == (expected or (0, 0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-3, 1, 1e4])
 def test_random_rays(ad: Any, scale: float) -> None:
     lower, upper = (np.array(corner, np.float32) * np.float32(scale) for corner in (LOWER, UPPER))

@@ -68,6 +68,7 @@ def test_constant_boxes_agree_with_their_closed_form(y: float, count: int) -> No
     assert (y == -3.0) == (image[:, 5].max() == 0)
 
 
+@pytest.mark.slow
 def test_absorbing_fog_agrees_with_a_homogeneous_medium() -> None:
     """Mitsuba's volpath is noisy here, but its mean is right."""
     scale = 0.8  # densities are per length of the field, a medium's per length of the world
@@ -89,6 +90,7 @@ def test_absorbing_fog_agrees_with_a_homogeneous_medium() -> None:
     assert means[0].std() > 0.1  # something is to be seen
 
 
+@pytest.mark.slow
 def test_white_furnace() -> None:
     """Where everything shines with 1, nothing can be told apart."""
     field = formula_dict("gaussian", place().translate([0.3, 0, 0]), peak=4.0, width=0.3)
@@ -117,6 +119,7 @@ def soft_fields(names: str = "ab") -> dict[str, dict[str, Any]]:
     return dict(zip(names, (blob, shell), strict=True))
 
 
+@pytest.mark.slow
 def test_the_order_of_fields_does_not_matter() -> None:
     one = render(scene_of(nerf(aovs=AOVS), wall=wall(0.3), sky=sky(), **soft_fields("ab")))
     two = render(scene_of(nerf(aovs=AOVS), wall=wall(0.3), sky=sky(), **soft_fields("ba")))
@@ -125,6 +128,7 @@ def test_the_order_of_fields_does_not_matter() -> None:
     np.testing.assert_array_equal(two[..., 9], 3 - one[..., 9])
 
 
+@pytest.mark.slow
 def test_a_field_of_nothing_changes_nothing(tmp_path: Path) -> None:
     """Samples that were merged with others give what they give alone."""
     file = small_file(tmp_path)
@@ -140,6 +144,7 @@ def test_a_field_of_nothing_changes_nothing(tmp_path: Path) -> None:
     assert 0.2 < image[..., 5].mean() < 0.999
 
 
+@pytest.mark.slow
 def test_fields_that_are_empty_where_they_overlap(tmp_path: Path) -> None:
     contents = mi_nerf.load_field(small_file(tmp_path))
     empty = mi_nerf.FieldFile(
@@ -154,6 +159,7 @@ def test_fields_that_are_empty_where_they_overlap(tmp_path: Path) -> None:
     np.testing.assert_allclose(image, render(scene_of(nerf(None), fog=fog)), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_instances_show_what_copies_show(tmp_path: Path) -> None:
     """One medium in two cubes, or two media of one file."""
     file = small_file(tmp_path)
@@ -181,6 +187,7 @@ def test_instances_show_what_copies_show(tmp_path: Path) -> None:
     assert {1, 2} <= set(np.unique(images[0][..., 9]))
 
 
+@pytest.mark.slow
 def test_a_scene_that_moves_with_its_camera_looks_the_same() -> None:
     move = place().translate([3, -1, 2]).rotate([0.6, 0, 0.8], 70).scale(2.5)
     plain = scene_of(nerf(aovs=AOVS), wall=lamp(0.3, half=1.5), **soft_fields())
@@ -255,6 +262,7 @@ def test_xml() -> None:
 # ---- Surfaces -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_surfaces_are_seen_through_the_field(tmp_path: Path) -> None:
     """Fields keep their colours; what is behind is weakened in linear light, sRGB or not."""
     for space in ("srgb", "linear"):
@@ -290,6 +298,7 @@ def test_fields_of_two_colour_spaces(tmp_path: Path) -> None:
     np.testing.assert_allclose(both, sum(alone), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_cube_casts_no_shadow() -> None:
     """With a null BSDF it would block the nested integrator's rays to a point light."""
     light = {"type": "point", "position": [0, -3.0, 1.0], "intensity": rgb((20, 20, 20))}
@@ -300,6 +309,7 @@ def test_the_cube_casts_no_shadow() -> None:
     assert image[..., 0].max() > 0.1
 
 
+@pytest.mark.slow
 def test_surfaces_that_change_are_followed() -> None:
     scene = mi.load_dict(
         scene_of(
@@ -333,15 +343,19 @@ def test_surfaces_are_left_out_without_a_nested_integrator() -> None:
     np.testing.assert_array_equal(image, render(scene_of(nerf(None, aovs=AOVS), field=field)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nested", ["direct", "volpath", "prb", "prb_basic", "prbvolpath"])
 def test_nested_integrators_of_all_kinds(nested: str) -> None:
-    solids = {"wall": wall(0.2), "sky": sky()}
-    field = slab(place(), 0.5, GLOW)
-    image = render(scene_of(nerf(nested), field=field, **solids), spp=64)
-    path = render(scene_of(nerf({"type": "path", "max_depth": 2}), field=field, **solids), spp=64)
-    np.testing.assert_allclose(image, path, atol=0.05)
+    """They show what ``path`` shows: their means differ by no more than they scatter."""
+    solids = {"wall": wall(0.2), "sky": sky(), "field": slab(place(), 0.5, GLOW)}
+    two = [mi.load_dict(scene_of(nerf(kind), **solids)) for kind in (nested, "path")]
+    images = [render(two[0], spp=16, seed=i) - render(two[1], spp=16, seed=i) for i in range(16)]
+    mean, error = np.mean(images, axis=0), np.std(images, axis=0, ddof=1) / 4
+    assert np.abs(mean / np.hypot(error, 1e-3)).max() < 6
+    assert np.abs(mean.mean(axis=(0, 1))).max() < 2e-3
 
 
+@pytest.mark.slow
 def test_several_paths_a_ray_are_less_noisy() -> None:
     """Of the same camera rays, whose values converge with the number of paths."""
     light = lamp(0.0, (6.0, 5.0, 4.0))
@@ -454,6 +468,7 @@ CHANGES: dict[str, tuple[dict[str, Any], float, float]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nested", ["path", "prb"])
 @pytest.mark.parametrize("kind", CHANGES)
 def test_gradients_agree_with_finite_differences(kind: str, nested: str, tmp_path: Path) -> None:
@@ -591,6 +606,7 @@ def test_nested_integrators_that_cannot_render(nested: dict[str, Any], message: 
     assert "2 nested integrators, expected at most one" in refused(integrator=two)
 
 
+@pytest.mark.slow
 def test_normalised_device_coordinates_stand_alone(tmp_path: Path) -> None:
     file = small_file(tmp_path, ndc=Ndc(1.0, 1.0))
     box = {"type": "cube", "interior": {"type": "nerfmedium", "filename": str(file)}}
@@ -610,6 +626,7 @@ def test_normalised_device_coordinates_stand_alone(tmp_path: Path) -> None:
 # ---- Recovery -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_pose_is_recovered_from_an_image() -> None:
     """The recipe of README: descent on a field's place, from a picture of it elsewhere."""
     field = formula_dict("two_color", place().scale([0.8, 0.5, 0.4]), density=6.0)

@@ -125,6 +125,7 @@ def difference_errors(scene: Any, contents: Any, pull: np.ndarray) -> dict[str, 
     return errors
 
 
+@pytest.mark.slow
 def test_mi_render_agrees_with_the_trainer(setup: Any) -> None:
     errors = trainer_errors(*setup)
     assert max(errors.values()) < 1e-4, errors
@@ -135,6 +136,7 @@ def test_mi_render_agrees_with_finite_differences(setup: Any) -> None:
     assert max(errors.values()) < 1e-4, errors
 
 
+@pytest.mark.slow
 def test_forward_mode_is_the_transpose_of_backward_mode(setup: Any) -> None:
     scene, _, pull = setup
     gradient = rendered_gradient(scene, pull)
@@ -153,6 +155,7 @@ def test_forward_mode_is_the_transpose_of_backward_mode(setup: Any) -> None:
     assert float(np.sum(slope * pull)) == pytest.approx(expected, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_srgb_fields_differentiate_at_zero_opacity(tmp_path: Path) -> None:
     mi.set_variant("llvm_ad_rgb")
     path = small_file(tmp_path, density_shift=-60.0)
@@ -161,6 +164,7 @@ def test_srgb_fields_differentiate_at_zero_opacity(tmp_path: Path) -> None:
     assert all(np.isfinite(g).all() for g in gradient.values())
 
 
+@pytest.mark.slow
 def test_chunks_do_not_change_the_gradient(setup: Any) -> None:
     scene, _, pull = setup
     whole = rendered_gradient(scene, pull)

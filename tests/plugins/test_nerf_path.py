@@ -98,6 +98,7 @@ def room() -> dict[str, dict[str, Any]]:
 # ---- Without anything to see ----------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -134,6 +135,7 @@ def test_depth_zero_shows_nothing() -> None:
     assert image[..., :3].max() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("y", [-3.0, 0.3, 3.0])
 def test_depth_one_shows_what_emits(y: float) -> None:
     """Fields and the lamp behind them, as the integrator nerf shows them; closed form."""
@@ -155,6 +157,7 @@ def test_depth_one_shows_what_emits(y: float) -> None:
 # ---- Fields that absorb ---------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_absorbing_fog_agrees_with_a_homogeneous_medium() -> None:
     """All light that a room reflects passes it, in Mitsuba's volpath and here."""
     scale = 0.8
@@ -191,6 +194,7 @@ TWO_BOXES = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("light", ["point", "directional"])
 @pytest.mark.parametrize("count", [1, 2])
 def test_shadows_of_fields_agree_with_closed_form_transmittance(light: str, count: int) -> None:
@@ -248,6 +252,7 @@ def irradiance_of_box(p: np.ndarray, transform: Any, density: float, cells: int 
     return np.pi * np.array(sums)
 
 
+@pytest.mark.slow
 def test_light_of_a_constant_box_agrees_with_its_closed_form() -> None:
     """On a floor below, for every camera ray on its own, with the box sampled as a light or not."""
     move = place().translate([0.1, 0.2, 0.1]).rotate([0.3, 1, 0.2], 25).scale([0.5, 0.4, 0.3])
@@ -269,6 +274,7 @@ def test_light_of_a_constant_box_agrees_with_its_closed_form() -> None:
     assert np.square(errors[1]).mean() < np.square(errors[0]).mean() / 10  # 27 when it was made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampled", [True, False])
 def test_an_opaque_field_is_an_area_light(sampled: bool) -> None:
     """A floor and a glossy ball receive the same from a box that shines."""
@@ -290,6 +296,7 @@ def test_an_opaque_field_is_an_area_light(sampled: bool) -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampled", [True, False])
 def test_white_furnace(sampled: bool) -> None:
     """Where everything shines or reflects with 1, nothing can be told apart."""
@@ -325,6 +332,7 @@ def along(scene: Any, o: np.ndarray, d: np.ndarray) -> np.ndarray:
     return np.array(radiance, np.float64).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", ["srgb", "linear"])
 def test_a_mirror_shows_what_a_mirrored_camera_sees(space: str, tmp_path: Path) -> None:
     file = small_file(tmp_path, color_space=space)
@@ -344,6 +352,7 @@ def test_a_mirror_shows_what_a_mirrored_camera_sees(space: str, tmp_path: Path) 
     assert expected.mean() > 0.05
 
 
+@pytest.mark.slow
 def test_glass_shows_what_is_behind_it() -> None:
     """A pane that neither reflects nor refracts, and the same without."""
     pane = {**wall(-1.5), "bsdf": {"type": "thindielectric", "int_ior": 1.0, "ext_ior": 1.0}}
@@ -356,6 +365,7 @@ def test_glass_shows_what_is_behind_it() -> None:
 # ---- Several fields, channels, settings -----------------------------------------
 
 
+@pytest.mark.slow
 def test_the_order_of_fields_does_not_matter() -> None:
     one = formula_dict("gaussian", place().translate([-0.2, 0.1, 0]), peak=3.0, width=0.35)
     two = formula_dict("shell", place().rotate([1, 0, 0], 70).scale([1.4, 1, 1]), density=3.0)
@@ -368,6 +378,7 @@ def test_the_order_of_fields_does_not_matter() -> None:
     assert images[0].std() > 0.1
 
 
+@pytest.mark.slow
 def test_channels_are_those_of_camera_rays() -> None:
     """As the integrator nerf has them; alpha too, where there is no sky."""
     objects = {
@@ -382,6 +393,7 @@ def test_channels_are_those_of_camera_rays() -> None:
     assert expected[..., 3].min() < 0.1 and expected[..., 3].max() > 0.999
 
 
+@pytest.mark.slow
 def test_bounds_of_the_distance_are_those_of_cameras(tmp_path: Path) -> None:
     """A field file's near plane hides the field from the camera, not from the light."""
     contents = mi_nerf.load_field(small_file(tmp_path))

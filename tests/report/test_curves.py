@@ -20,6 +20,7 @@ from mi_nerf.report.curves_text import conclusions, seconds_to
 from mi_nerf.training import run as training
 from mi_nerf.training.config import TrainConfig
 from mi_nerf.training.run import Run, TrainingError
+from tests.support.clock import Clock
 
 TINY = ["network.width=8", "network.view_width=8", "sampling.batch=512", "sampling.samples=8"]
 TINY += ["sampling.render_samples=8", "occupancy.resolution=8", "steps=6"]
@@ -51,7 +52,10 @@ def test_rows_are_all_combinations() -> None:
 # ---- Looking at a run ---------------------------------------------------------------
 
 
-def test_looks_take_no_training_time_and_change_nothing(blob: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_looks_take_no_training_time_and_change_nothing(
+    blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (config,) = tiny().values()
     plain = training.start(blob, tmp_path / "plain", config, VARIANT)
     plain.train(show_bar=False)
@@ -60,20 +64,18 @@ def test_looks_take_no_training_time_and_change_nothing(blob: Path, tmp_path: Pa
     def look(run: Run) -> dict[str, Any]:
         run.field_file().build(run.trainer._backend)
         seen.append(run.progress)
-        time.sleep(0.5)
+        clock.now += 1000
         return {}
 
-    start = time.monotonic()
+    monkeypatch.setattr(time, "monotonic", clock := Clock())
     watched = training.start(blob, tmp_path / "watched", config, VARIANT)
     watch = Watch(tmp_path / "watched", 3, look)
     watched.train(show_bar=False, after_step=watch)
-    elapsed = time.monotonic() - start
     # Shares of 1/16, 1/4 and 1 of 6 steps: after the first, the second and the last.
     assert seen == pytest.approx([1 / 6, 2 / 6, 1])
     lines = read_curve(tmp_path / "watched")
     assert [line["step"] for line in lines] == [1, 2, 6]
-    assert watched.seconds < elapsed - 1.4
-    assert lines[-1]["seconds"] <= watched.seconds
+    assert 0 < lines[-1]["seconds"] <= watched.seconds < 1
     for name, weights in plain.trainer.field.weights().items():
         assert (weights == watched.trainer.field.weights()[name]).all(), name
 
@@ -101,6 +103,7 @@ def test_looks_that_a_checkpoint_has_not_seen_are_repeated(tmp_path: Path) -> No
 # ---- The whole ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_models_and_seeds(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows, out = tiny(("network.width", ["8", "12"])), tmp_path / "out"
     options: dict[str, Any] = {"seeds": 2, "views": 2, "looks": 3}
@@ -123,6 +126,7 @@ def test_models_and_seeds(blob: Path, tmp_path: Path, monkeypatch: pytest.Monkey
         training_curves(blob, out, rows, VARIANT, **{**options, "looks": 4})
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was_stopped(
     blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -148,6 +152,7 @@ def test_it_goes_on_where_it_was_stopped(
     assert [line["step"] for line in record["rows"][0]["runs"][1]["curve"]] == [1, 6]
 
 
+@pytest.mark.slow
 def test_failures_are_counted(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(self: Run, show_bar: bool = True, after_step: Any = None) -> None:
         raise TrainingError("collapsed")
@@ -181,6 +186,7 @@ def test_what_curves_say() -> None:
     assert "1 runs failed" in text
 
 
+@pytest.mark.slow
 def test_the_command(blob: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     options = ["--presets", "nerf", "--vary", "network.width=8,12", "--seeds", "1", "--steps", "3"]

@@ -63,6 +63,7 @@ def test_published_cost_of_a_query() -> None:
     assert training_flop(config) == 6 * 593_408 - 2 * (2 * 63 * 256 + 27 * 128)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variety", VARIETIES)
 def test_counted_gradients_are_those_that_are_computed(
     variety: str, views: Dataset, monkeypatch: pytest.MonkeyPatch
@@ -97,6 +98,7 @@ def test_entries_of_a_grid_are_no_arithmetic() -> None:
     assert training_flop(one) == training_flop(other)
 
 
+@pytest.mark.slow
 def test_product_rate_is_a_rate() -> None:
     assert 0.1 < numpy_product_rate() < 1e5
 
@@ -134,6 +136,7 @@ def test_without_a_recorder_nothing_is_evaluated() -> None:
     assert not dr.flag(dr.JitFlag.KernelHistory)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variety", VARIETIES)
 def test_recording_changes_no_kernel(variety: str, views: Dataset) -> None:
     """All that two equal trainers launch, with boundaries and without."""
@@ -156,6 +159,7 @@ def test_recording_changes_no_kernel(variety: str, views: Dataset) -> None:
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variety", VARIETIES)
 def test_stages_and_python_add_up_to_the_step(variety: str, views: Dataset) -> None:
     trainer = Trainer(small(variety), views, ad)

@@ -37,6 +37,7 @@ BACKEND = array_module(VARIANT)
 directions = st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: np.linalg.norm(v) > 0.1)
 
 
+@pytest.mark.slow
 @given(directions)
 def test_the_disc_is_the_hemisphere_from_above(direction: Any) -> None:
     """A field that emits half of one plus the direction in which light travels."""
@@ -61,6 +62,7 @@ def test_the_disc_is_the_hemisphere_from_above(direction: Any) -> None:
     assert np.cross(right, up) @ normal > 0
 
 
+@pytest.mark.slow
 @given(directions)
 def test_normals_point_out_of_a_blob(direction: Any) -> None:
     out = unit(np.array([direction]))[0]
@@ -94,6 +96,7 @@ def test_even_density_has_no_normal() -> None:
         surface_normal(field, (0, 0, 0), BACKEND)
 
 
+@pytest.mark.slow
 def test_points_lie_on_what_cameras_see() -> None:
     field = AnalyticField(ball(0.5, 1000.0))
     camera = Intrinsics.from_angle_x(32, 32, 0.5)
@@ -107,6 +110,7 @@ def test_points_lie_on_what_cameras_see() -> None:
         find_points(MarchedField(empty, march), camera, orbit_poses(6), BACKEND)
 
 
+@pytest.mark.slow
 def test_deviation_measures_view_dependence(tmp_path: Path) -> None:
     dull = AnalyticField(gaussian((0, 0, 0), 0.3, 5.0))
     shiny = AnalyticField(
@@ -119,6 +123,7 @@ def test_deviation_measures_view_dependence(tmp_path: Path) -> None:
     assert iio.imread(tmp_path / "a.png").ndim == 3
 
 
+@pytest.mark.slow
 def test_the_command(blob_run: Path, tmp_path: Path) -> None:
     points = ["--point", "0.1", "0.2", "0.3", "--point", "-0.2", "0", "0.1"]
     out = ["--out", str(tmp_path / "out"), "--no-profile", "--no-speed"]
@@ -133,6 +138,7 @@ def test_the_command(blob_run: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "out/step_time.png").exists()
 
 
+@pytest.mark.slow
 def test_steps_of_a_run_are_measured_and_the_run_stays_as_it_is(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -151,6 +157,7 @@ def test_steps_of_a_run_are_measured_and_the_run_stays_as_it_is(
     assert f"a training step takes {step['step_ms']:.1f} ms" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_without_a_readable_checkpoint_the_profile_is_left_out(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

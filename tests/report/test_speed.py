@@ -136,6 +136,7 @@ def test_every_setting_once_and_the_own_first() -> None:
             assert setting.grid is not None and setting.march == subject.marched.settings
 
 
+@pytest.mark.slow
 def test_splits_make_equally_many_queries() -> None:
     """Counted while the field is rendered: 2 · coarse + fine samples of rays in the box."""
     coarse = NeuralField.create(SMALL, 1, BACKEND.TensorXf)
@@ -153,6 +154,7 @@ def test_splits_make_equally_many_queries() -> None:
 # ---- Errors -----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "values"), [("gaussian", {"peak": 20.0}), ("shell", {"edge": 0.0})]
 )
@@ -190,6 +192,7 @@ def test_errors_are_those_against_the_oracle(kind: str, values: dict[str, Any]) 
         assert by_rule[32, "linear"] > 1.5 * by_rule[32, "constant"]
 
 
+@pytest.mark.slow
 def test_grids_leave_out_what_their_threshold_says() -> None:
     """Opacity lost to a grid grows with the threshold; queries fall."""
     subject = open_subject("gaussian", VARIANT, rays=400, views=2)
@@ -202,6 +205,7 @@ def test_grids_leave_out_what_their_threshold_says() -> None:
     assert queries == sorted(queries, reverse=True) and queries[0] < own["queries_per_ray"]
 
 
+@pytest.mark.slow
 def test_slow_fields_are_measured_on_fewer_rays() -> None:
     subject = open_subject("slab", VARIANT, rays=2000)
     record = sweep(subject, NONE, repeats=1, seconds=1e-4)
@@ -209,6 +213,7 @@ def test_slow_fields_are_measured_on_fewer_rays() -> None:
     assert record["reference"]["max_intervals"] == 512
 
 
+@pytest.mark.slow
 def test_rays_are_pixels_of_the_views(blob_run: Path) -> None:
     """All pixels: the PSNR is that of the evaluation's images taken together."""
     subject = open_subject(blob_run, VARIANT, views=2)
@@ -317,6 +322,7 @@ def test_choosing_for_a_budget() -> None:
 # ---- The command ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_report_of_a_run(blob_run: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "out"
     options = ["--no-profile", "--rays", "300", "--views", "2", "--repeats", "2"]
@@ -343,6 +349,7 @@ def test_report_of_a_run(blob_run: Path, tmp_path: Path, capsys: Any) -> None:
     assert speed["points"][costs.index(min(costs))]["pareto"]
 
 
+@pytest.mark.slow
 def test_report_of_a_formula(tmp_path: Path) -> None:
     out = tmp_path / "out"
     options = ["--set", "density=20", "edge=0", "--rays", "300", "--repeats", "1"]
@@ -360,6 +367,7 @@ def test_report_of_a_formula(tmp_path: Path) -> None:
     assert {"rule constant", "rule linear", "own settings"} <= lines
 
 
+@pytest.mark.slow
 def test_report_of_a_field_file(tmp_path: Path) -> None:
     """Looked at from around its box; without images there is no model error."""
     path = small_file(tmp_path, samples=16)
@@ -373,6 +381,7 @@ def test_report_of_a_field_file(tmp_path: Path) -> None:
     assert "which knows no cameras" in record["view_dependence_left_out"]
 
 
+@pytest.mark.slow
 def test_bad_input(refused: Callable[..., str], run: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     assert "spher: not found, expected a run folder, a field file or one of slab" in refused(

@@ -157,6 +157,6 @@ def ndc_rays(o: Any, d: Any) -> tuple[Any, Any]:
 # ---- Training (row 20) -----------------------------------------------------------
 
 
-def summed_progress(steps: int) -> float:
-    """Share of a run after all of its steps, added up step by step in single precision."""
-    return float(np.cumsum(np.full(steps, 1 / steps, np.float32), dtype=np.float32)[-1])
+def summed_progress(steps: int, done: int) -> float:
+    """Share of a run of ``steps`` after some, added up step by step in single precision."""
+    return float(np.cumsum(np.full(done, 1 / steps, np.float32), dtype=np.float32)[-1])

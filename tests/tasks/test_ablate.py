@@ -65,6 +65,7 @@ def test_small_presets_get_a_hierarchy_too() -> None:
     assert config.position.frequencies == 10
 
 
+@pytest.mark.slow
 def test_a_table_with_seeds(blob: Path, tmp_path: Path) -> None:
     rows = ["no-h", "complete"]
     record = ablate(blob, tmp_path / "out", tiny(), "llvm_ad_rgb", rows=rows, seeds=2)
@@ -83,6 +84,7 @@ def test_a_table_with_seeds(blob: Path, tmp_path: Path) -> None:
     assert iio.imread(tmp_path / "out/ablation.png").ndim == 3
 
 
+@pytest.mark.slow
 def test_it_goes_on_where_it_was_stopped(
     blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -111,6 +113,7 @@ def test_it_goes_on_where_it_was_stopped(
     assert started[3:] == ["l5"] and len(more["rows"]) == 3
 
 
+@pytest.mark.slow
 def test_failures_are_counted(blob: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def failing(self: Run, show_bar: bool = True, after_step: object = None) -> None:
         raise TrainingError("collapsed")
@@ -122,6 +125,7 @@ def test_failures_are_counted(blob: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert not (tmp_path / "out/ablation.png").exists()
 
 
+@pytest.mark.slow
 def test_fewer_images(blob: Path, tmp_path: Path) -> None:
     config = replace(complete(tiny()), views=3)
     run = training.start(blob, tmp_path / "run", config, "llvm_ad_rgb")
@@ -129,6 +133,7 @@ def test_fewer_images(blob: Path, tmp_path: Path) -> None:
     assert run.trainer._source._views == 3
 
 
+@pytest.mark.slow
 def test_bad_input(refused: Callable[..., str], blob: Path, tmp_path: Path) -> None:
     data, out = shutil.copytree(blob, tmp_path / "data"), tmp_path / "out"
     assert "row 'no-pee': unknown" in refused("ablate", data, "--out", out, "--rows", "no-pee")
@@ -138,6 +143,7 @@ def test_bad_input(refused: Callable[..., str], blob: Path, tmp_path: Path) -> N
     assert "with other settings" in refused("ablate", data, "--out", out, "--steps", "3")
 
 
+@pytest.mark.slow
 def test_the_command(blob: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     options = ["--rows", "complete", "--steps", "2", "--views", "2", "--set", *TINY]
     assert main(["ablate", str(blob), "--out", str(tmp_path / "out"), *options]) == 0

@@ -32,6 +32,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     return folder, record, text.getvalue()
 
 
+@pytest.mark.slow
 def test_everything_is_there(demo: tuple[Path, dict[str, Any], str]) -> None:
     folder, record, text = demo
     assert {p.name for p in folder.iterdir()} == {
@@ -50,6 +51,7 @@ def test_everything_is_there(demo: tuple[Path, dict[str, Any], str]) -> None:
     assert iio.imread(folder / "comparison.png").shape == (2 * 40, 3 * 40, 3)
 
 
+@pytest.mark.slow
 def test_the_dataset(demo: tuple[Path, dict[str, Any], str]) -> None:
     folder = demo[0]
     for split, count in VIEWS.items():
@@ -68,6 +70,7 @@ def test_the_dataset(demo: tuple[Path, dict[str, Any], str]) -> None:
     ).any()  # held out
 
 
+@pytest.mark.slow
 def test_the_comparison_begins_with_the_truth(demo: tuple[Path, dict[str, Any], str]) -> None:
     folder = demo[0]
     picture = iio.imread(folder / "comparison.png")[::2, ::2].astype(float)
@@ -78,6 +81,7 @@ def test_the_comparison_begins_with_the_truth(demo: tuple[Path, dict[str, Any], 
     assert picture[:20, 40:] == pytest.approx(np.minimum(5 * error, 255), abs=1)
 
 
+@pytest.mark.slow
 def test_the_scene_renders(
     demo: tuple[Path, dict[str, Any], str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -54,6 +54,7 @@ def record(blob_run: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str
 # ---- The record ----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_keys_and_types(record: dict[str, Any]) -> None:
     types = {
         "protocol": str,
@@ -177,6 +178,7 @@ def test_no_ssim_of_images_smaller_than_its_window(blob_run: Path, tmp_path: Pat
     assert small["mean"]["psnr"] > 0
 
 
+@pytest.mark.slow
 def test_perfect_images_do_not_hide_the_others(
     record: dict[str, Any], data: Path, blob_run: Path, tmp_path: Path
 ) -> None:

@@ -20,11 +20,8 @@ from mi_nerf.base.color import linear_to_srgb
 from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.cameras.pinhole import Intrinsics, sensor_dict
 from mi_nerf.cameras.poses import look_at
-from mi_nerf.cameras.trajectory import look_center, orbit, orbit_like, spiral_like
 from mi_nerf.cli import main
-from mi_nerf.data import load_dataset
 from mi_nerf.march.view import render_view
-from tests.support.datasets import orbit_poses
 from tests.support.fields import scene_dict, small_file
 
 
@@ -89,6 +86,7 @@ def test_names_in_capitals(blob_run: Path, tmp_path: Path) -> None:
     assert read_png(render(blob_run, tmp_path / "A.PNG")).shape == (24, 24, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size", "stored"), [((32, 26), (26, 32)), ((33, 27), (28, 34))])
 def test_videos(
     size: tuple[int, int],
@@ -124,6 +122,7 @@ def test_a_folder_with_a_dot_must_exist(blob_run: Path, tmp_path: Path) -> None:
     assert (tmp_path / "v1.2" / "orbit_000.png").is_file()
 
 
+@pytest.mark.slow
 def test_test_views_are_those_of_the_evaluation(blob_run: Path, tmp_path: Path) -> None:
     folder = render(blob_run, tmp_path / "views", "--path", "test")
     files = sorted(folder.iterdir())
@@ -150,6 +149,7 @@ def test_some_test_views(blob_run: Path, tmp_path: Path) -> None:
         assert picture == (every / f"test_{old:03d}.png").read_bytes()
 
 
+@pytest.mark.slow
 def test_size_keeps_the_field_of_view(blob_run: Path, tmp_path: Path) -> None:
     options = ["--path", "test"]
     small = read_exr(render(blob_run, tmp_path / "a.exr", *options))
@@ -160,6 +160,7 @@ def test_size_keeps_the_field_of_view(blob_run: Path, tmp_path: Path) -> None:
     assert wide == pytest.approx(small[6:18], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_spp_averages_over_the_pixel(blob_run: Path, tmp_path: Path) -> None:
     options = ["--path", "test"]
     fine = read_exr(render(blob_run, tmp_path / "a.exr", *options, "--size", 48, 48))
@@ -290,6 +291,7 @@ def test_pixel_formats(aovs: str, pixels: str, scene: Callable[..., Path], tmp_p
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("space", ["linear", "srgb"])
 def test_mitsuba_sees_what_evaluation_sees(space: str, tmp_path: Path) -> None:
     """One field, one camera, once through ``mi.render`` and once through ``render_view``."""
@@ -313,83 +315,3 @@ def test_mitsuba_sees_what_evaluation_sees(space: str, tmp_path: Path) -> None:
     difference = np.abs(np.concatenate([view.color, view.opacity[..., None]], axis=-1) - seen)
     assert difference.max() < 0.08
     assert (difference.mean(axis=(0, 1)) < 0.003).all()
-
-
-# --------------------------------------------------------------------------
-#   Trajectories
-# --------------------------------------------------------------------------
-
-
-def assert_looks_at(poses: np.ndarray, center: np.ndarray, up: np.ndarray) -> None:
-    """Rigid, upright OpenGL poses with ``center`` in the middle of the picture."""
-    for pose in poses:
-        rotation = pose[:3, :3]
-        assert rotation.T @ rotation == pytest.approx(np.eye(3), abs=1e-9)
-        assert np.linalg.det(rotation) == pytest.approx(1)
-        assert pose[3].tolist() == [0, 0, 0, 1]
-        ahead = center - pose[:3, 3]
-        assert -rotation[:, 2] == pytest.approx(ahead / np.linalg.norm(ahead), abs=1e-9)
-        assert rotation[:, 1] @ up > 0
-        assert rotation[:, 0] @ up == pytest.approx(0, abs=1e-9)  # a level horizon
-
-
-@pytest.mark.parametrize("up", [(0, 0, 1), (0, -1, 0), (1, 0, 0)])
-@pytest.mark.parametrize("height", [-0.6, 0.0, 0.8])
-def test_orbit(up: tuple[int, int, int], height: float) -> None:
-    center, axis = np.array([1.0, -2.0, 3.0]), np.array(up, float)
-    poses = orbit(center, axis, 2.5, height, 12)
-    assert poses.shape == (12, 4, 4)
-    assert_looks_at(poses, center, axis)
-    offset = poses[:, :3, 3] - center
-    assert np.linalg.norm(offset, axis=1) == pytest.approx(np.full(12, 2.5))
-    assert offset @ axis == pytest.approx(np.full(12, 2.5 * height))
-    steps = np.linalg.norm(np.roll(offset, -1, axis=0) - offset, axis=1)
-    assert steps == pytest.approx(np.full(12, steps[0]))  # even, and once around
-
-
-@pytest.mark.parametrize("up", [0, 1, 2])
-def test_orbit_like_given_cameras(up: int) -> None:
-    """The circle of the cameras themselves, whichever axis points up."""
-    shift = np.array([0.5, 0.2, -0.3])
-    poses = orbit_poses(7, radius=3.0, height=1.2)
-    order = np.roll(np.eye(4)[[2, 0, 1, 3]], 0, axis=0) if up == 0 else np.eye(4)
-    if up == 1:
-        order = np.eye(4)[[1, 2, 0, 3]]
-    poses = order @ poses
-    poses[:, :3, 3] += shift
-    axis = order[:3, 2]
-    assert look_center(poses) == pytest.approx(shift, abs=1e-4)
-    found = orbit_like(poses, 9)
-    assert_looks_at(found, look_center(poses), axis)
-    offset = found[:, :3, 3] - shift
-    assert np.linalg.norm(offset, axis=1) == pytest.approx(np.full(9, np.hypot(3.0, 1.2)), abs=1e-3)
-    assert offset @ axis == pytest.approx(np.full(9, 1.2), abs=1e-3)
-
-
-def test_spiral_rises_in_two_turns() -> None:
-    poses = np.concatenate([orbit_poses(9, 3.0, h) for h in (0.2, 1.0, 2.0)])
-    poses[:, :3, 3] *= 3 / np.linalg.norm(poses[:, :3, 3], axis=1, keepdims=True)
-    found = spiral_like(poses, 40)
-    center = look_center(poses)
-    assert center == pytest.approx(np.zeros(3), abs=1e-4)
-    assert_looks_at(found, center, np.array([0.0, 0.0, 1.0]))
-    assert np.linalg.norm(found[:, :3, 3] - center, axis=1) == pytest.approx(np.full(40, 3.0))
-    heights = found[:, 2, 3]
-    assert (np.diff(heights) > 0).all()
-    assert poses[:, 2, 3].min() - 1e-3 <= heights[0] < heights[-1] <= poses[:, 2, 3].max() + 1e-3
-    angles = np.unwrap(np.arctan2(found[:, 1, 3], found[:, 0, 3]))
-    assert abs(angles[-1] - angles[0]) == pytest.approx(4 * np.pi * 39 / 40)
-
-
-@pytest.mark.parametrize("count", [1, 2])
-def test_paths_around_few_cameras(count: int) -> None:
-    """Even one camera gives finite paths that look at what it may be looking at."""
-    poses = orbit_poses(3)[:count]
-    for path in (orbit_like, spiral_like):
-        found = path(poses, 5)
-        assert found.shape == (5, 4, 4) and np.isfinite(found).all()
-
-
-def test_one_frame(blob: Path) -> None:
-    poses = load_dataset(blob, "train").cam_to_world
-    assert orbit_like(poses, 1).shape == spiral_like(poses, 1).shape == (1, 4, 4)

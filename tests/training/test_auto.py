@@ -87,6 +87,7 @@ def test_what_follows_from_the_data(diffuse: Dataset) -> None:
     assert config.background == "white" and config.preset == "auto"
 
 
+@pytest.mark.slow
 def test_without_time_for_probes_it_is_preset_fast(diffuse: Dataset) -> None:
     config, decisions = decided(start(steps=10), diffuse, llvm)
     fast = preset("fast")
@@ -97,6 +98,7 @@ def test_without_time_for_probes_it_is_preset_fast(diffuse: Dataset) -> None:
     assert "3 views, too few to hold any back" in str(decisions[-1])
 
 
+@pytest.mark.slow
 def test_the_choice_is_that_of_a_trainer_left_alone(diffuse: Dataset) -> None:
     """Values found are those that a run of preset fast would find for itself."""
     config, _ = decided(start(steps=1), diffuse, llvm)
@@ -167,6 +169,7 @@ def script(
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("averaged", "flat", "needed"),
     [
@@ -191,6 +194,7 @@ def test_directions_go_only_if_both_tests_say_so(
     assert "30.00" in reason and f"{averaged:.2f}" in reason
 
 
+@pytest.mark.slow
 def test_the_network_grows_while_it_pays(script: Any) -> None:
     answers = {"1x64": probe(30.0), "2x64": probe(30.1, seconds=0.02)}
     config, decisions, asked = script(answers)
@@ -212,6 +216,7 @@ def test_twice_the_time_has_to_bring_more_than_twice_the_steps() -> None:
     assert not worth_growing(probe(30.0), probe(30.01))
 
 
+@pytest.mark.slow
 def test_fourier_features_where_they_learn_more(script: Any) -> None:
     answers = {"1x64": probe(30.0), "fourier": probe(30.2)}
     config, decisions, _ = script(answers)
@@ -225,6 +230,7 @@ def test_fourier_features_where_they_learn_more(script: Any) -> None:
     assert "fourier" in asked and "no time" in str(decisions[-1])
 
 
+@pytest.mark.slow
 def test_nothing_is_decided_without_a_first_probe(script: Any) -> None:
     for first in (None, probe(math.nan, steps=40)):
         config, decisions, asked = script({"1x64": first})
@@ -232,6 +238,7 @@ def test_nothing_is_decided_without_a_first_probe(script: Any) -> None:
         assert "too short for probes" in str(decisions[-1])
 
 
+@pytest.mark.slow
 def test_what_the_user_sets_is_neither_probed_nor_changed(script: Any) -> None:
     answers = {"1x64": probe(30.0, averaged=31.0), "1x64 flat": probe(31.0)}
     answers |= {"1x48": probe(30.0, averaged=30.0), "fourier": probe(29.0)}
@@ -251,6 +258,7 @@ def test_what_the_user_sets_is_neither_probed_nor_changed(script: Any) -> None:
 # ---- Probes ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["diffuse", "mirror"])
 def test_directions_are_seen_where_they_matter(
     kind: str, diffuse: Dataset, mirror: Dataset
@@ -293,6 +301,7 @@ def test_views_are_held_back(diffuse: Dataset) -> None:
     assert len(runs) == 4 and not held & others and held | others == set(diffuse.names)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_probes_keep_to_their_share_of_steps(
     diffuse: Dataset, monkeypatch: pytest.MonkeyPatch
@@ -312,6 +321,7 @@ def test_probes_keep_to_their_share_of_steps(
     assert prober(diffuse, replace(config, steps=30)).first(config) is None
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_probes_keep_to_their_share_of_seconds(
     diffuse: Dataset, monkeypatch: pytest.MonkeyPatch
@@ -333,6 +343,7 @@ def test_probes_keep_to_their_share_of_seconds(
     assert prober(diffuse, replace(config, max_seconds=480.0)).first(config).steps == 16
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_probes_depend_on_the_seed_alone(diffuse: Dataset) -> None:
     """Without a hash grid, whose gradients are summed in the order of threads."""
@@ -343,6 +354,7 @@ def test_probes_depend_on_the_seed_alone(diffuse: Dataset) -> None:
     assert other.quality != found[0].quality
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_run_goes_on_from_the_best_probe(
     diffuse: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -367,6 +379,7 @@ def test_the_run_goes_on_from_the_best_probe(
 # ---- Runs --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_run_records_and_shows_its_reasons(
     diffuse: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -386,6 +399,7 @@ def test_a_run_records_and_shows_its_reasons(
         assert line in said and line in shown
 
 
+@pytest.mark.slow
 def test_an_unknown_record_of_reasons_is_passed_over(
     diffuse: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -398,6 +412,7 @@ def test_an_unknown_record_of_reasons_is_passed_over(
         assert "auto:" not in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_resumed_run_does_not_probe(
     diffuse: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -414,6 +429,7 @@ def test_a_resumed_run_does_not_probe(
     assert (tmp_path / "run/config.json").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_an_interrupted_choice_leaves_nothing(
     diffuse: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

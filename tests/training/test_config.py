@@ -188,6 +188,7 @@ def test_refusals(assignments: str, said: str) -> None:
     assert "\n" not in message
 
 
+@pytest.mark.slow
 @given(st.text(max_size=12), st.text(max_size=12))
 def test_any_text_is_either_taken_or_refused(key: str, text: str) -> None:
     for name in (key, "network.width", "optimizer.lr", "box", "occupancy.hull", "loss"):

@@ -18,6 +18,7 @@ from mi_nerf.fields.fourier import FourierEncoding
 from mi_nerf.fields.hash_grid import HashGridConfig
 from mi_nerf.fields.network import NetworkConfig
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.render import render_rays
 from mi_nerf.training import loss_scale
 from mi_nerf.training.checkpoint import Progress, load_checkpoint, save_checkpoint
@@ -69,6 +70,7 @@ def relative_error(found: np.ndarray, expected: np.ndarray) -> float:
     return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(seed=st.integers(0, 1000), config=st.sampled_from(CONFIGS))
 def test_derivatives_are_those_of_single_precision(
@@ -83,6 +85,7 @@ def test_derivatives_are_those_of_single_precision(
     assert max(errors.values()) > 0.1 * HALF  # it is half precision
 
 
+@pytest.mark.slow
 def test_small_gradients_need_the_scale(ad: Any) -> None:
     """Adjoints of 1e-8 are less than half precision can hold."""
     expected = gradients(ad, BASE, None, size=1e-9)
@@ -159,6 +162,7 @@ def small(*changes: str) -> TrainConfig:
     )
 
 
+@pytest.mark.slow
 def test_it_learns_as_in_single_precision(ad: Any, views: Dataset) -> None:
     errors = []
     for half in ("true", "false"):
@@ -169,6 +173,7 @@ def test_it_learns_as_in_single_precision(ad: Any, views: Dataset) -> None:
     assert errors[0] < 0.02
 
 
+@pytest.mark.slow
 def test_an_overflow_is_declined_and_answered(ad: Any, views: Dataset) -> None:
     trainer = Trainer(small(), views, ad)
     assert trainer.loss_scale is not None
@@ -192,10 +197,11 @@ def test_overflowing_activations_are_declined(ad: Any, views: Dataset) -> None:
     for name, weight in trainer.field.weights().items():
         np.testing.assert_array_equal(weight, before[name])
     o, d = vectors(ad, [(0.1, -3, 0.2)]), vectors(ad, [(0, 1, 0)])
-    seen = render_rays(trainer.field, o, d, trainer.march_settings())
+    seen = render_rays(MarchedField(trainer.field, trainer.march_settings()), o, d)
     assert np.isfinite([c[0] for c in (*seen.color, seen.opacity)]).all()
 
 
+@pytest.mark.slow
 def test_it_goes_on_from_a_checkpoint(ad: Any, views: Dataset, tmp_path: Path) -> None:
     trainer = Trainer(small(), views, ad)
     assert trainer.loss_scale is not None
@@ -207,6 +213,7 @@ def test_it_goes_on_from_a_checkpoint(ad: Any, views: Dataset, tmp_path: Path) -
     np.testing.assert_array_equal(other.loss_scale.state(), [2.0**9, 7])
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_full_precision_is_refused(ad: Any, views: Dataset, tmp_path: Path) -> None:
     save_checkpoint(
         tmp_path / "c", Trainer(small("half_precision=false"), views, ad), Progress(0.0)
