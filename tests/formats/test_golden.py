@@ -13,6 +13,7 @@ import pytest
 
 import mi_nerf
 from mi_nerf.cli import main
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.render import render_rays
 from tests.golden.make import DATA_PATH
 
@@ -46,7 +47,7 @@ def test_fields_look_as_they_did(golden: Path, name: str) -> None:
     contents = mi_nerf.load_field(golden / f"{name}.safetensors")
     field, occupancy = contents.build(ad)
     o, d = (ad.Array3f(np.array(wanted[key], np.float32).T) for key in "od")
-    seen = render_rays(field, o, d, contents.march, occupancy=occupancy)
+    seen = render_rays(MarchedField(field, contents.march, occupancy), o, d)
     color = np.stack([np.array(c) for c in seen.color], axis=1)
     assert max(wanted["opacity"]) > 0.5
     np.testing.assert_allclose(color, wanted["color"], atol=1e-5)

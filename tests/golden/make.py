@@ -44,6 +44,7 @@ from mi_nerf.cameras.ndc import Ndc
 from mi_nerf.fields.fourier import FourierEncoding
 from mi_nerf.fields.hash_grid import HashGridConfig
 from mi_nerf.fields.network import NetworkConfig
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
 
@@ -158,7 +159,7 @@ def rendered(path: Path, o: np.ndarray, d: np.ndarray) -> dict[str, Any]:
     contents = load_field(path)
     field, occupancy = contents.build(backend)
     rays = [mi.Vector3f(*(backend.Float(a[:, i]) for i in range(3))) for a in (o, d)]
-    seen = render_rays(field, *rays, contents.march, occupancy=occupancy)
+    seen = render_rays(MarchedField(field, contents.march, occupancy), *rays)
     return {
         "o": o.tolist(),
         "d": d.tolist(),

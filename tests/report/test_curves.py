@@ -43,7 +43,7 @@ def test_rows_are_all_combinations() -> None:
     assert all(c.sampling.samples == 9 for c in rows.values())
     with pytest.raises(InputError, match=r"unknown setting, expected .*network.width"):
         rows_of(["nerf"], {"network.widht": ["8"]})
-    with pytest.raises(InputError, match="network.width=x: expected a whole number"):
+    with pytest.raises(InputError, match="settings='network.width=x': expected a whole number"):
         rows_of(["nerf"], {"network.width": ["x"]})
     with pytest.raises(InputError, match="nothing to train"):
         rows_of([], {})
