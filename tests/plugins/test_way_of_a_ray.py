@@ -6,6 +6,8 @@ import importlib
 import re
 import subprocess
 import sys
+import textwrap
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -40,17 +42,23 @@ def scene(**integrator: Any) -> Any:
     )
 
 
-def told() -> list[str]:
-    """The names in the two drawings of the docstring."""
+def drawings() -> list[str]:
+    """The two of the docstring: forwards and backwards."""
     text = importlib.import_module("mi_nerf.plugins").__doc__ or ""
-    drawings = re.findall(r"::\n\n((?:    .*\n|\n)+)", text)
-    assert len(drawings) == 2
-    return re.findall(r"^ +((?:\w+\.)+\w+)", "".join(drawings), flags=re.MULTILINE)
+    found = re.findall(r"::\n\n((?:    .*\n|\n)+)", text)
+    assert len(found) == 2
+    return [textwrap.dedent(drawing).strip() for drawing in found]
+
+
+def test_the_documents_show_the_same() -> None:
+    page = Path(__file__).parents[2] / "docs/how-it-works.md"
+    assert f"```text\n{drawings()[0]}\n```" in page.read_text()
 
 
 def test_everything_on_the_way_exists() -> None:
     """A class whose file has been said once stands without it from then on."""
-    names, classes = told(), {"Traced": "field_scene"}
+    names = re.findall(r"^ *((?:\w+\.)+\w+)", "\n".join(drawings()), flags=re.MULTILINE)
+    classes = {"Traced": "field_scene"}
     assert len(names) > 14
     for name in names:
         parts = name.split(".")
