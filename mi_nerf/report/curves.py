@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import InputError, Option
-from ..base.files import make_folder, read_json, replacing, write_json
+from ..base.files import make_folder, read_json, write_json, write_text
 from ..base.machine import machine
 from ..data import held_out_split, load_dataset
 from ..tasks.evaluate import evaluate
@@ -152,8 +152,7 @@ class Watch:
         with run.clock_stopped():
             seen = {"look": due, "step": run.trainer.step_count, "seconds": run.seconds}
             self._lines.append({**seen, **self._look(run)})
-            with replacing(self._file) as temporary:
-                temporary.write_text("".join(json.dumps(line) + "\n" for line in self._lines))
+            write_text(self._file, map(json.dumps, self._lines))
 
 
 def read_curve(folder: Path) -> list[Record]:

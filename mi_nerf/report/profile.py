@@ -12,10 +12,10 @@ import drjit as dr
 import numpy as np
 
 from ..base.errors import InputError
-from ..base.files import replacing
 from ..base.kernel_stages import Launch, recording
 from ..base.variants import array_module
 from ..data import load_dataset
+from ..tasks.tables import markdown_table, save_figure
 from ..tasks.target import Target
 from ..training.checkpoint import load_checkpoint
 from ..training.run_folder import CHECKPOINT, read_config
@@ -240,7 +240,13 @@ def markdown(record: dict[str, Any]) -> list[str]:
     limits, step_ms = record["product_gflops"], record["step_ms"]
     shares = {name: 100 * record["gflops"] / limit for name, limit in limits.items()}
     launched = sum(record["launches"].values())
-    lines = [
+    stages = [(text, record["stages"][k], record["launches"][k]) for k, text in LABELS.items()]
+    stages.append(("a step", sum(record["stages"].values()), launched))
+    rows = [
+        (label, f"{spent:.2f}", f"{100 * spent / step_ms:.1f} %", f"{count:.1f}")
+        for label, spent, count in stages
+    ]
+    return [
         f"A step takes {step_ms:.2f} ms, the median of {record['rounds']} rounds of "
         f"{record['round_steps']} steps ({record['fastest_ms']:.2f} to "
         f"{record['slowest_ms']:.2f} ms), each step waited for.",
@@ -257,15 +263,7 @@ def markdown(record: dict[str, Any]) -> list[str]:
         "",
         f"![Time of a step by stages]({FIGURE})",
         "",
-        "| stage | ms | share | launches |",
-        "|---|---|---|---|",
-    ]
-    for name, label in LABELS.items():
-        spent, count = record["stages"][name], record["launches"][name]
-        lines.append(f"| {label} | {spent:.2f} | {100 * spent / step_ms:.1f} % | {count:.1f} |")
-    total = sum(record["stages"].values())
-    lines += [
-        f"| a step | {total:.2f} | {100 * total / step_ms:.1f} % | {launched:.1f} |",
+        *markdown_table(("stage", "ms", "share", "launches"), rows),
         "",
         "Stages are measured on the device, by the times of their kernels, in other steps, in",
         f"which each stage waits for its kernels ({record['profiled_ms']:.2f} ms a step). A kernel",
@@ -276,7 +274,6 @@ def markdown(record: dict[str, Any]) -> list[str]:
         "step does here, as on a busy machine, they are scaled to fit. Neither padding of the last",
         "block nor queries of the occupancy grid count as arithmetic.",
     ]
-    return lines
 
 
 def draw(path: Path, record: dict[str, Any]) -> None:
@@ -293,5 +290,4 @@ def draw(path: Path, record: dict[str, Any]) -> None:
     axes.margins(x=0.12)
     axes.set_xlabel("ms a step")
     axes.spines[["top", "right"]].set_visible(False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(path, figure)

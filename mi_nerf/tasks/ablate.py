@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import InputError
-from ..base.files import make_folder, replacing, write_json
+from ..base.files import make_folder, write_json, write_text
 from ..fields.fourier import FourierEncoding
 from ..training.config import TrainConfig, to_json
 from ..training.run import Run
 from .evaluate import evaluate
 from .series import check_same, mean, trained
-from .target import open_target
+from .tables import markdown_table, number, save_figure, spread
 
 RECORD, TABLE, FIGURE = "ablation.json", "ablation.md", "ablation.png"
 
@@ -152,8 +152,7 @@ def ablate(
 
 def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]:
     """What the table says of a finished run."""
-    target = open_target(run.folder)
-    found = evaluate(target, variant, split=settings["split"], views=settings["views"])
+    found = evaluate(run.folder, variant, split=settings["split"], views=settings["views"])
     names = ("queries_per_ray", "parameters", "views", "size")
     return {**found["mean"], "train_seconds": run.seconds, **{n: found[n] for n in names}}
 
@@ -170,8 +169,7 @@ def _write(
         if runs
     ]
     write_json(folder / RECORD, record)
-    with replacing(folder / TABLE) as temporary:
-        temporary.write_text(table(record))
+    write_text(folder / TABLE, table(record).splitlines())
     if any(row["psnr"] is not None for row in record["rows"]):
         _draw(folder / FIGURE, record)
     return record
@@ -187,30 +185,21 @@ def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 def table(record: dict[str, Any]) -> str:
     """The rows as Markdown."""
-    lines = [
-        "| | PSNR (dB) | range | SSIM | train (s) | queries/ray | parameters | failures |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in record["rows"]:
-        values = [run["psnr"] for run in row["runs"] if run["failed"] is None]
-        numbers = [v for v in values if v is not None]
-        spread = f"{min(numbers):.2f} to {max(numbers):.2f}" if len(numbers) > 1 else ""
-        cells = [
+    head = "|PSNR (dB)|range|SSIM|train (s)|queries/ray|parameters|failures"
+    rows = [
+        [
             row["title"],
-            _text(row["psnr"], ".2f"),
-            spread,
-            _text(row["ssim"], ".4f"),
-            _text(row["train_seconds"], ".0f"),
-            _text(row["queries_per_ray"], ".1f"),
-            _text(row["parameters"], ",.0f"),
+            number(row["psnr"], ".2f"),
+            spread([run["psnr"] for run in row["runs"] if run.get("psnr") is not None]),
+            number(row["ssim"], ".4f"),
+            number(row["train_seconds"], ".0f"),
+            number(row["queries_per_ray"], ".1f"),
+            number(row["parameters"], ",.0f"),
             f"{row['failures']} of {row['seeds']}",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _text(value: float | None, form: str) -> str:
-    return "n/a" if value is None else format(value, form)
+        for row in record["rows"]
+    ]
+    return "\n".join(markdown_table(head.split("|"), rows)) + "\n"
 
 
 def _draw(path: Path, record: dict[str, Any]) -> None:
@@ -231,5 +220,4 @@ def _draw(path: Path, record: dict[str, Any]) -> None:
     axes.invert_yaxis()
     axes.set_xlim(left=min(row["psnr"] for row in rows) - 3)
     axes.set_xlabel("PSNR (dB), mean of seeds; points: each seed")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(path, figure)

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-import platform
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-
-from .._version import __version__
 from ..base.errors import InputError
 from ..base.files import read_json
+from ..base.machine import versions
 from ..base.tensor_file import read_metadata
 from ..base.variants import available_variants
 from ..data import available_splits, load_dataset
@@ -25,14 +22,9 @@ from ..training.run_folder import CHECKPOINT, CONFIG, FIELD, read_record
 
 def system() -> str:
     """Versions, the compiler, and the variants that work here."""
-    import mitsuba as mi
-
     variants = available_variants()
     rows = {
-        "mi_nerf": __version__,
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "python": platform.python_version(),
+        **versions(),
         "cores": str(os.cpu_count()),
         "LLVM library": os.environ.get("DRJIT_LIBLLVM_PATH", "left to Dr.Jit"),
         "variants": ", ".join(variants) or "none works on this machine",

@@ -19,16 +19,17 @@ from ..base.arrays import Image
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError, Option
 from ..base.files import make_folder, replacing
-from ..base.variants import array_module
+from ..base.variants import active_variant, array_module
 from ..data import Dataset, load_dataset
 from ..images.metrics import psnr, ssim, to_8bit
 from ..march.view import display_image, render_view
-from .target import Target
+from ..training.run import Run
+from .target import Target, open_target
 
 
 def evaluate(
-    target: Target,
-    variant: str,
+    target: str | Path | Target | Run,
+    variant: str | None = None,
     *,
     data: str | Path | None = None,
     split: str = "test",
@@ -37,23 +38,27 @@ def evaluate(
     images: str | Path | None = None,
     on_image: Callable[[dict[str, Any], int], None] | None = None,
 ) -> dict[str, Any]:
-    """Renders held-out views and measures them against the dataset.
+    """Measures held-out views by the nerf2020 protocol, as ``mi-nerf eval``.
 
     Args:
-        data, downscale: default to those of the run.
-        views: only so many views, evenly spread over the split.
-        images: a folder for the rendered views, as 8-bit PNG on white.
+        target: a run or its folder, or a field file (then with ``data``).
+        data, downscale: dataset and scale; default: as the run was trained.
+        split: which views.
+        views: only so many, evenly spread.
+        images: write the rendered views to this folder, as 8-bit PNG on white.
         on_image: called with each image's result and the number of images.
 
     Returns:
-        The record that ``mi-nerf eval --json`` writes.
+        The record that ``mi-nerf eval --json`` writes: ``["mean"]["psnr"]`` in dB,
+        ``["mean"]["ssim"]``, ``["images"]``, ``["seconds_per_view"]``, ``["queries_per_ray"]``.
 
     Raises:
         InputError: if there is no dataset to compare with, or it cannot be read.
     """
+    target = open_target(target)
     dataset = held_out(target, data, split, downscale, views)
     folder = None if images is None else make_folder(images)
-    backend = array_module(variant)
+    backend = array_module(active_variant(variant))
     marched = target.contents.marched(backend)
     results: list[dict[str, Any]] = []
     qualities: list[dict[str, float]] = []
