@@ -20,8 +20,8 @@ from .base.progress_bar import progress_bar
 from .base.variants import active_variant
 from .data import Dataset
 from .scene_xml.library import find_scene
-from .tasks import describe as info
 from .tasks import render as rendering
+from .tasks.describe import describe
 from .tasks.evaluate import evaluate, reference_image
 from .tasks.target import Target
 from .training import run as training
@@ -204,15 +204,6 @@ def render(
 def pictures(dataset: Dataset) -> list[Image]:
     """The views of a dataset as :func:`evaluate` sees them: (H, W, 3) sRGB on white, 8 bits."""
     return [reference_image(dataset, k) for k in range(len(dataset))]
-
-
-def describe(target: str | Path | None = None) -> str:
-    """What this machine offers, or what a run, checkpoint, field or dataset holds.
-
-    Raises:
-        InputError: if the target is nothing that mi_nerf knows.
-    """
-    return info.system() if target is None else info.describe(Path(target))
 
 
 def _assignments(settings: Settings) -> list[str]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.checks import at_least_one
 from ..base.errors import InputError, Option
 from ..base.files import make_folder, read_json, write_json, write_text
 from ..base.machine import machine
@@ -95,9 +96,7 @@ def training_curves(
     Raises:
         InputError: if the data cannot be read, or the folder holds something else.
     """
-    for name, value in (("seeds", seeds), ("views", views), ("looks", looks)):
-        if value < 1:
-            raise InputError("{}: expected at least 1", Option(name, value))
+    at_least_one(seeds=seeds, views=views, looks=looks)
     split = split or held_out_split(data)
     if split is None:
         raise InputError(
@@ -202,22 +201,14 @@ def summary(name: str, runs: list[Record]) -> Record:
         lines = [line for run in good for line in run["curve"] if line["look"] == look]
         values = [line["psnr"] for line in lines if line["psnr"] is not None]
         if values:
-            curve.append(
-                {
-                    "seconds": mean(line["seconds"] for line in lines),
-                    "psnr": mean(values),
-                    "least": min(values),
-                    "greatest": max(values),
-                    "seeds": len(values),
-                }
-            )
+            point = {"seconds": mean(line["seconds"] for line in lines), "psnr": mean(values)}
+            point |= {"least": min(values), "greatest": max(values), "seeds": len(values)}
+            curve.append(point)
     last = [run["curve"][-1] for run in good]
+    keys = ("psnr", "ssim", "queries_per_ray", "seconds")
     return {
         "name": name,
-        "psnr": mean(line["psnr"] for line in last),
-        "ssim": mean(line["ssim"] for line in last),
-        "queries_per_ray": mean(line["queries_per_ray"] for line in last),
-        "seconds": mean(line["seconds"] for line in last),
+        **{key: mean(line[key] for line in last) for key in keys},
         "parameters": mean(run["parameters"] for run in good),
         "seeds": len(runs),
         "failures": len(runs) - sum(run["failed"] is None for run in runs),

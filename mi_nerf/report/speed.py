@@ -12,8 +12,9 @@ errors are told apart:
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
@@ -27,7 +28,6 @@ from ..march.render import render_rays
 from ..march.rules import Rule
 from ..march.settings import MarchSettings
 from .grids import Grids, own_resolution
-from .pareto import pareto_front
 from .subject import Subject
 
 Array = np.ndarray[Any, Any]
@@ -239,6 +239,26 @@ def _errors(subject: Subject, seen: Seen, exact: Reference) -> dict[str, Any]:
         },
         "psnr": subject.psnr(shown),
     }
+
+
+def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
+    """Marks the points for which no other is as cheap and as exact, and better in one of both.
+
+    Equal points are marked alike. NaN in either number leaves a point out.
+
+    >>> pareto_front([1, 2, 3, 3], [0.5, 0.2, 0.3, 0.1])
+    [True, True, False, True]
+    """
+    pairs = enumerate(zip(costs, errors, strict=True))
+    usable = [i for i, pair in pairs if not any(map(math.isnan, pair))]
+    marked = [False] * len(costs)
+    best = float("inf")  # least error among cheaper points
+    cost_of_best = float("-inf")
+    for i in sorted(usable, key=lambda i: (costs[i], errors[i])):
+        if errors[i] < best:
+            best, cost_of_best = errors[i], costs[i]
+        marked[i] = errors[i] == best and costs[i] == cost_of_best
+    return marked
 
 
 def _mark_front(points: list[dict[str, Any]], by: str, floor: float) -> None:

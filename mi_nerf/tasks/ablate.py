@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..base.errors import InputError
 from ..base.files import make_folder, write_json, write_text
@@ -20,11 +20,9 @@ from .tables import markdown_table, number, save_figure, spread
 RECORD, TABLE, FIGURE = "ablation.json", "ablation.md", "ablation.png"
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One line of the table: what is changed of the complete model."""
 
-    name: str
     title: str
     change: Callable[[TrainConfig], TrainConfig]
 
@@ -80,22 +78,17 @@ def _views(count: int) -> Callable[[TrainConfig], TrainConfig]:
 
 
 ROWS = {
-    row.name: row
-    for row in (
-        Row(
-            "no-pe-vd-h",
-            "No PE, VD, H",
-            lambda c: _no_hierarchy(_no_view_dependence(_no_encoding(c))),
-        ),
-        Row("no-pe", "No positional encoding", _no_encoding),
-        Row("no-vd", "No view dependence", _no_view_dependence),
-        Row("no-h", "No hierarchical sampling", _no_hierarchy),
-        Row("25-images", "Far fewer images (25)", _views(25)),
-        Row("50-images", "Fewer images (50)", _views(50)),
-        Row("l5", "Fewer frequencies (L = 5)", _octaves(5)),
-        Row("l15", "More frequencies (L = 15)", _octaves(15)),
-        Row("complete", "Complete model", lambda c: c),
-    )
+    "no-pe-vd-h": Row(
+        "No PE, VD, H", lambda c: _no_hierarchy(_no_view_dependence(_no_encoding(c)))
+    ),
+    "no-pe": Row("No positional encoding", _no_encoding),
+    "no-vd": Row("No view dependence", _no_view_dependence),
+    "no-h": Row("No hierarchical sampling", _no_hierarchy),
+    "25-images": Row("Far fewer images (25)", _views(25)),
+    "50-images": Row("Fewer images (50)", _views(50)),
+    "l5": Row("Fewer frequencies (L = 5)", _octaves(5)),
+    "l15": Row("More frequencies (L = 15)", _octaves(15)),
+    "complete": Row("Complete model", lambda c: c),
 }
 
 

@@ -33,12 +33,15 @@ def system() -> str:
     return _table(rows)
 
 
-def describe(path: Path) -> str:
-    """What lies at ``path``.
+def describe(target: str | Path | None = None) -> str:
+    """What this machine offers, or what a run, checkpoint, field or dataset holds.
 
     Raises:
-        InputError: if it is nothing that mi_nerf knows.
+        InputError: if the target is nothing that mi_nerf knows.
     """
+    if target is None:
+        return system()
+    path = Path(target)
     if not path.exists():
         raise InputError(
             f"{path}: not found, expected a run, a .safetensors file or a dataset folder"

@@ -16,6 +16,7 @@ import imageio.v3 as iio
 import numpy as np
 
 from ..base.arrays import Image
+from ..base.checks import at_least_one
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError, Option
 from ..base.files import make_folder, replacing
@@ -24,6 +25,7 @@ from ..data import Dataset, load_dataset
 from ..images.metrics import psnr, ssim, to_8bit
 from ..march.view import display_image, render_view
 from ..training.run import Run
+from .tables import number
 from .target import Target, open_target
 
 
@@ -69,7 +71,8 @@ def evaluate(
         seconds.append(time.perf_counter() - start)
         queries += view.queries
         predicted = to_8bit(display_image(view, marched.field.color_space))
-        figures = _compare(predicted, reference_image(dataset, k))
+        truth = reference_image(dataset, k)
+        figures = {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
         qualities.append(figures)
         result = {"name": name, **{key: _finite(value) for key, value in figures.items()}}
         results.append(result)
@@ -98,10 +101,7 @@ def evaluate(
 def quality(record: dict[str, Any]) -> str:
     """The mean PSNR and SSIM of a record of :func:`evaluate`, for people."""
     psnr_mean, ssim_mean = record["mean"]["psnr"], record["mean"]["ssim"]
-    return (
-        f"PSNR {'n/a' if psnr_mean is None else format(psnr_mean, '.2f')} dB, "
-        f"SSIM {'n/a' if ssim_mean is None else format(ssim_mean, '.4f')}"
-    )
+    return f"PSNR {number(psnr_mean, '.2f')} dB, SSIM {number(ssim_mean, '.4f')}"
 
 
 def reference_image(dataset: Dataset, index: int) -> Image:
@@ -122,11 +122,8 @@ def held_out(
     Raises:
         InputError: if there are none, or they are not of the kind it was trained on.
     """
-    if views is not None and views < 1:
-        raise InputError("{}: expected at least 1", Option("views", views))
     scale = target.downscale if downscale is None else downscale
-    if scale < 1:
-        raise InputError("{}: expected at least 1", Option("downscale", scale))
+    at_least_one(views=1 if views is None else views, downscale=scale)
     path = Path(data) if data is not None else target.data
     if path is None:
         raise InputError(
@@ -158,10 +155,6 @@ def _require_same_projection(target: Target, dataset: Dataset) -> None:
         raise InputError(
             f"{dataset.path}: {theirs}, expected about {ours} as {target.path} was trained with"
         )
-
-
-def _compare(predicted: Image, truth: Image) -> dict[str, float]:
-    return {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
 
 
 def _mean(values: list[float]) -> float | None:

@@ -12,12 +12,14 @@ import imageio.v2 as imageio
 import numpy as np
 
 from ..base.arrays import Image
+from ..base.checks import valid_size
 from ..base.color import srgb_to_linear
 from ..base.errors import InputError, Option
 from ..base.files import check_file, check_folder, make_folder, replacing
 from ..base.variants import array_module, using_variant
 from ..cameras.pinhole import Intrinsics
-from ..cameras.trajectory import Poses, forward_spiral, orbit_like, spiral_like
+from ..cameras.poses import mitsuba_from_opengl, opengl_from_mitsuba
+from ..cameras.trajectory import Poses, forward_spiral, orbit, orbit_like, spiral_like
 from ..data import Dataset, held_out_split, load_dataset
 from ..images.write import on_white, write_picture
 from ..march.view import render_view
@@ -296,17 +298,16 @@ def _resized(intrinsics: Intrinsics, size: tuple[int, int] | None) -> Intrinsics
     """The same horizontal field of view on a film of another size."""
     if size is None:
         return intrinsics
-    if min(size) < 1:
-        raise InputError("{}: expected two numbers of at least 1", Option("size", size))
-    scale = size[0] / intrinsics.width
+    width, height = valid_size(size)
+    scale = width / intrinsics.width
     return replace(
         intrinsics,
-        width=size[0],
-        height=size[1],
+        width=width,
+        height=height,
         fx=intrinsics.fx * scale,
         fy=intrinsics.fy * scale,
         cx=intrinsics.cx * scale,
-        cy=intrinsics.cy * size[1] / intrinsics.height,
+        cy=intrinsics.cy * height / intrinsics.height,
     )
 
 
@@ -336,8 +337,6 @@ def _moving(
     """Moves a sensor around the scene's box, at its own distance and height."""
     import mitsuba as mi
 
-    from ..cameras.poses import mitsuba_from_opengl, opengl_from_mitsuba
-
     parameters = mi.traverse(sensor)
     start = opengl_from_mitsuba(np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4))
     center = np.array(scene.bbox().center(), np.float64).ravel()
@@ -352,8 +351,6 @@ def _moving(
 
 def _aim(pose: Image, center: Image) -> Image:
     """A ring of cameras like ``pose`` that all look at ``center``."""
-    from ..cameras.trajectory import orbit
-
     offset = pose[:3, 3] - center
     radius = float(np.linalg.norm(offset))
     strongest = int(np.argmax(np.abs(pose[:3, 1])))
