@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,11 @@ import numpy as np
 
 from ..base.checks import at_least_one
 from ..base.errors import InputError, Option
-from ..base.files import make_folder, read_json, write_json, write_text
+from ..base.files import read_json, write_text
 from ..base.machine import machine
-from ..data import held_out_split, load_dataset
+from ..data import load_dataset, split_to_measure
 from ..tasks.evaluate import evaluate
-from ..tasks.series import check_same, mean, trained
+from ..tasks.series import all_trained, mean, trained
 from ..tasks.target import Target
 from ..training.config import TrainConfig, setting_names, to_json, with_settings
 from ..training.presets import preset
@@ -97,11 +96,7 @@ def training_curves(
         InputError: if the data cannot be read, or the folder holds something else.
     """
     at_least_one(seeds=seeds, views=views, looks=looks)
-    split = split or held_out_split(data)
-    if split is None:
-        raise InputError(
-            "{}: has training views alone, expected {}", data, Option("split", "train")
-        )
+    split = split_to_measure(data, split)
     load_dataset(data, split, limit=1)  # before hours of work
     folder = Path(out)
     settings = {
@@ -111,24 +106,18 @@ def training_curves(
         "looks": looks,
         "rows": {name: to_json(config) for name, config in rows.items()},
     }
-    check_same(folder, RECORD, settings, "a report on trainings")
     record = {"settings": settings, "machine": machine(variant), "complete": False, "rows": []}
-    make_folder(folder)
-    write_json(folder / RECORD, record)
-    results: dict[str, list[Record]] = {name: [] for name in rows}
-    for seed in range(seeds):  # whole sets first: an early end leaves something to compare
-        for name, config in rows.items():
-            wanted = replace(config, seed=config.seed + seed)
-            if on_run is not None:
-                on_run(name, wanted.seed)
-            place = folder / "runs" / _slug(name) / f"seed_{wanted.seed}"
-            watch = Watch(place, looks, lambda run: _look(run, split, views))
-            result = trained(data, place, wanted, variant, _ending, given=given, after_step=watch)
-            if result is None:
-                return _finish(folder, record, results)
-            results[name].append({**result, "seed": wanted.seed, "curve": read_curve(place)})
-    record["complete"] = True
-    return _finish(folder, record, results)
+
+    def train(name: str, config: TrainConfig) -> Record | None:
+        if on_run is not None:
+            on_run(name, config.seed)
+        place = folder / "runs" / _slug(name) / f"seed_{config.seed}"
+        watch = Watch(place, looks, lambda run: _look(run, split, views))
+        result = trained(data, place, config, variant, _ending, given=given, after_step=watch)
+        return result and {**result, "seed": config.seed, "curve": read_curve(place)}
+
+    file = folder / RECORD
+    return all_trained(record, rows, seeds, train, summary, file, "a report on trainings")
 
 
 class Watch:
@@ -185,12 +174,6 @@ def _ending(run: Run) -> Record:
 def _slug(name: str) -> str:
     """A name as that of a folder."""
     return "".join(c if c.isalnum() or c in "._-=" else "_" for c in name.replace(", ", "__"))
-
-
-def _finish(folder: Path, record: Record, results: Mapping[str, list[Record]]) -> Record:
-    record["rows"] = [summary(name, runs) for name, runs in results.items() if runs]
-    write_json(folder / RECORD, record)
-    return record
 
 
 def summary(name: str, runs: list[Record]) -> Record:

@@ -132,6 +132,7 @@ def profile_steps(
         plain.append(stopwatch.plain_round(count))
     kernels = [sum(k.milliseconds for k in r.launches) for r in profiled]
     typical = profiled[int(np.argsort(kernels)[len(kernels) // 2])]
+    parts = [part_of_step(launch) for launch in typical.launches]
     milliseconds = [r.milliseconds for r in plain]
     step_ms = float(np.median(milliseconds))
     return StepProfile(
@@ -142,7 +143,7 @@ def profile_steps(
         slowest_ms=max(milliseconds),
         profiled_ms=typical.milliseconds,
         stages=stage_times(typical.launches, count, step_ms),
-        launches=_launch_counts(typical.launches, count),
+        launches={name: parts.count(name) / count for name in LABELS},
         compiled=sum(k.compiled for r in profiled for k in r.launches),
         rays=float(np.mean([r.rays for r in plain])),
         queries=float(np.mean([r.queries for r in plain])),
@@ -173,11 +174,6 @@ def stage_times(launches: list[Launch], steps: int, step_ms: float) -> dict[str,
     scale = min(1.0, step_ms / kernels) if kernels > 0 else 1.0
     parts = {name: scale * ms for name, ms in parts.items()}
     return parts | {"python": step_ms - scale * kernels}
-
-
-def _launch_counts(launches: list[Launch], steps: int) -> dict[str, float]:
-    parts = [part_of_step(launch) for launch in launches]
-    return {name: parts.count(name) / steps for name in LABELS}
 
 
 class _Stopwatch:

@@ -19,7 +19,7 @@ from ..base.errors import InputError, Option
 from ..base.variants import array_module
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from ..cameras.trajectory import orbit
-from ..data import held_out_split
+from ..data import split_to_measure
 from ..fields.closed_form import CLOSED_FORMS, closed_form
 from ..fields.protocol import Field
 from ..images.metrics import to_8bit
@@ -199,11 +199,7 @@ def _cameras(
     folder = target.data if data is None else Path(data)
     if folder is None:
         return _around(field, views)
-    split = split or held_out_split(folder)
-    if split is None:
-        raise InputError(
-            "{}: has training views alone, expected {}", folder, Option("split", "train")
-        )
+    split = split_to_measure(folder, split)
     images = held_out(target, data, split, downscale, views)
     truth = np.stack([reference_image(images, k) for k in range(len(images))])
     origin = {"data": str(folder), "split": images.split}

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..base.errors import InputError
-from ..base.files import make_folder, write_json, write_text
+from ..base.files import write_text
 from ..fields.fourier import FourierEncoding
 from ..training.config import TrainConfig, to_json
 from ..training.run import Run
 from .evaluate import evaluate
-from .series import check_same, mean, trained
+from .series import all_trained, mean, trained
 from .tables import markdown_table, number, save_figure, spread
 
 RECORD, TABLE, FIGURE = "ablation.json", "ablation.md", "ablation.png"
@@ -124,23 +124,19 @@ def ablate(
     base = complete(config)
     settings: dict[str, Any] = {"data": str(Path(data).resolve()), "split": split, "views": views}
     settings["base"] = to_json(base)
-    record = {"settings": settings, "complete": False, "rows": []}
-    check_same(folder, RECORD, settings, "an ablation")
-    make_folder(folder)
-    write_json(folder / RECORD, record)
-    results: dict[str, list[dict[str, Any]]] = {name: [] for name in rows}
-    for seed in range(seeds):  # whole tables first: an early end leaves something to compare
-        for name in rows:
-            wanted = replace(ROWS[name].change(base), seed=base.seed + seed)
-            print(f"{name}, seed {wanted.seed}", flush=True)
-            place = folder / name / f"seed_{wanted.seed}"
-            measure = partial(_quality, settings=settings, variant=variant)
-            result = trained(data, place, wanted, variant, measure)
-            if result is None:
-                return _write(folder, record, results)
-            results[name].append(result)
-    record["complete"] = True
-    return _write(folder, record, results)
+    record: dict[str, Any] = {"settings": settings, "complete": False, "rows": []}
+
+    def train(name: str, config: TrainConfig) -> dict[str, Any] | None:
+        print(f"{name}, seed {config.seed}", flush=True)
+        measure = partial(_quality, settings=settings, variant=variant)
+        return trained(data, folder / name / f"seed_{config.seed}", config, variant, measure)
+
+    configs = {name: ROWS[name].change(base) for name in rows}
+    all_trained(record, configs, seeds, train, _summary, folder / RECORD, "an ablation")
+    write_text(folder / TABLE, table(record).splitlines())
+    if any(row["psnr"] is not None for row in record["rows"]):
+        _draw(folder / FIGURE, record)
+    return record
 
 
 def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]:
@@ -153,27 +149,13 @@ def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]
 # ---- Table and figure --------------------------------------------------------
 
 
-def _write(
-    folder: Path, record: dict[str, Any], results: dict[str, list[dict[str, Any]]]
-) -> dict[str, Any]:
-    record["rows"] = [
-        {"name": name, "title": ROWS[name].title, **_summary(runs), "runs": runs}
-        for name, runs in results.items()
-        if runs
-    ]
-    write_json(folder / RECORD, record)
-    write_text(folder / TABLE, table(record).splitlines())
-    if any(row["psnr"] is not None for row in record["rows"]):
-        _draw(folder / FIGURE, record)
-    return record
-
-
-def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means over the runs that did not fail."""
+def _summary(name: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """A row of the record: means over the runs that did not fail."""
     good = [run for run in runs if run["failed"] is None]
     keys = ("psnr", "ssim", "train_seconds", "queries_per_ray", "parameters")
     means = {key: mean(run[key] for run in good) for key in keys}
-    return {**means, "seeds": len(runs), "failures": len(runs) - len(good)}
+    counts = {"seeds": len(runs), "failures": len(runs) - len(good)}
+    return {"name": name, "title": ROWS[name].title, **means, **counts, "runs": runs}
 
 
 def table(record: dict[str, Any]) -> str:

@@ -23,7 +23,7 @@ from ..cameras.trajectory import Poses, forward_spiral, orbit, orbit_like, spira
 from ..data import Dataset, held_out_split, load_dataset
 from ..images.write import on_white, write_picture
 from ..march.view import render_view
-from ..scene_xml.scene_file import load_scene
+from ..scene_xml.scene_file import SceneFile
 from .target import Target, open_target
 
 Path_ = Literal["orbit", "spiral", "test"]
@@ -156,7 +156,7 @@ def _scene_frames(
     """As :func:`scene_frames`, with the active variant."""
     import mitsuba as mi
 
-    scene = load_scene(scene_path)
+    scene = SceneFile(scene_path).load()
     sensors = scene.sensors()
     if not sensors:
         raise InputError(f"{scene_path}: has no sensor, expected at least one")
