@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Generator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -136,37 +137,9 @@ def scene_frames(
         InputError: if the scene cannot be loaded or has no sensor.
     """
 
-    def produce() -> Generator[Any, None, None]:
-        with using_variant(variant):
-            count, images = _scene_frames(scene_path, path, frames, size, spp)
-            yield count
-            yield from images
-
-    produced = produce()
-    return next(produced), produced
-
-
-def _scene_frames(
-    scene_path: str | Path,
-    path: Path_ | None,
-    frames: int,
-    size: tuple[int, int] | None,
-    spp: int,
-) -> tuple[int, Frames]:
-    """As :func:`scene_frames`, with the active variant."""
     import mitsuba as mi
 
-    scene = SceneFile(scene_path).load()
-    sensors = scene.sensors()
-    if not sensors:
-        raise InputError(f"{scene_path}: has no sensor, expected at least one")
-    if size is not None:
-        for sensor in sensors:
-            film = mi.traverse(sensor)
-            film["film.size"] = list(size)
-            film.update()
-
-    def render(sensor: Any, seed: int = 0) -> Image:
+    def render(scene: Any, sensor: Any, seed: int = 0) -> Image:
         try:
             return _rgba(mi.render(scene, sensor=sensor, spp=spp, seed=seed), sensor.film())
         except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
@@ -174,15 +147,32 @@ def _scene_frames(
                 raise InputError(f"{scene_path}: {error.__cause__}") from error
             raise
 
-    def still() -> Frames:
-        for i, sensor in enumerate(sensors):
-            yield f"sensor_{i:03d}", render(sensor)
+    def produce() -> Generator[Any, None, None]:
+        """The number of frames, and then these."""
+        with using_variant(variant):
+            scene = SceneFile(scene_path).load()
+            sensors = scene.sensors()
+            if not sensors:
+                raise InputError(f"{scene_path}: has no sensor, expected at least one")
+            if path == "test":
+                expected = "{}: a scene has no test views, expected {} or {}"
+                raise InputError(expected, scene_path, *_MOVING)
+            if size is not None:
+                for sensor in sensors:
+                    film = mi.traverse(sensor)
+                    film["film.size"] = list(size)
+                    film.update()
+            draw = partial(render, scene)
+            if path is not None:
+                yield frames
+                yield from _moving(scene, sensors[0], path, frames, draw)
+                return
+            yield len(sensors)
+            for i, sensor in enumerate(sensors):
+                yield f"sensor_{i:03d}", draw(sensor)
 
-    if path is None:
-        return len(sensors), still()
-    if path == "test":
-        raise InputError("{}: a scene has no test views, expected {} or {}", scene_path, *_MOVING)
-    return frames, _moving(scene, sensors[0], path, frames, render)
+    produced = produce()
+    return next(produced), produced
 
 
 def write_frames(
