@@ -80,7 +80,7 @@ class Plan:
     @property
     def scale(self) -> float:
         """A length that is typical of the scene."""
-        return max(_extent(self.box), self.radius)
+        return max(float(np.linalg.norm(np.subtract(*self.box))), self.radius)
 
     def of_split(self, split: str) -> list[View]:
         """The views of one split."""
@@ -362,7 +362,3 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 def _numbers(values: tuple[float, float, float]) -> str:
     return "(" + ", ".join(f"{v:.3g}" for v in values) + ")"
-
-
-def _extent(box: Bounds) -> float:
-    return float(np.linalg.norm(np.subtract(box[1], box[0])))

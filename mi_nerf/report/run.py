@@ -70,15 +70,12 @@ def report(
     """
     check_folder(out)
     subject = open_field(target, variant, values=values)
-    seen = None
     if knobs is not None:
         seen = open_subject(target, variant, values=values, data=data, **rays)
-    opened = None
-    if not subject.formula:
-        opened = open_target(target)
+    opened = None if subject.formula else open_target(target)
     places, no_places = _places(opened, subject, points, data)
     speed = None
-    if seen is not None:
+    if knobs is not None:
         speed = sweep(seen, knobs, repeats=repeats, on_render=on_render)
     folder = make_folder(out)
     record: dict[str, Any] = {
@@ -101,7 +98,9 @@ def report(
         )
     if profile:
         try:
-            record["step"] = _profile(opened, subject, variant, on_step)
+            if opened is None:
+                raise InputError(f"{subject.name}: a formula, which is not trained")
+            record["step"] = step_profile.profile_run(opened, variant, on_step)
             step_profile.draw(folder / step_profile.FIGURE, record["step"])
         except InputError as error:
             record["step_left_out"] = str(error)
@@ -139,14 +138,6 @@ def load(folder: str | Path) -> dict[str, Any]:
     if not isinstance(record, dict) or not ("speed" in record or "rows" in record):
         raise InputError(f"{path}: expected the record of a report")
     return record
-
-
-def _profile(
-    target: Target | None, subject: Subject, variant: str, on_step: Callable[[], object] | None
-) -> dict[str, Any]:
-    if target is None:
-        raise InputError(f"{subject.name}: a formula, which is not trained")
-    return step_profile.profile_run(target, variant, on_step)
 
 
 def _places(
