@@ -44,28 +44,15 @@ register_always()
 
 # Imported when first asked for: XML scenes need none of it.
 _LATER = {
-    "available_variants": "base.variants",
-    "choose_variant": "base.variants",
-    "Dataset": "data",
-    "load_dataset": "data",
-    "on_white": "images.write",
-    "write_picture": "images.write",
-    "psnr": "images.metrics",
-    "ssim": "images.metrics",
-    "find_scene": "scene_xml.library",
-    "scenes": "scene_xml.library",
-    "Target": "tasks.target",
-    "open_target": "tasks.target",
-    "TrainConfig": "training.config",
-    "setting_names": "training.config",
-    "Run": "training.run",
-    "TrainingError": "training.run",
-    "describe": "api",
-    "evaluate": "api",
-    "generate": "api",
-    "render": "api",
-    "start": "api",
-    "pictures": "api",
+    "base.variants": ("available_variants", "choose_variant"),
+    "data": ("Dataset", "load_dataset"),
+    "images.metrics": ("psnr", "ssim"),
+    "images.write": ("on_white", "write_picture"),
+    "scene_xml.library": ("find_scene", "scenes"),
+    "tasks.target": ("Target", "open_target"),
+    "training.config": ("TrainConfig", "setting_names"),
+    "training.run": ("Run", "TrainingError"),
+    "api": ("describe", "evaluate", "generate", "pictures", "render", "start"),
 }
 
 __all__ = [
@@ -103,9 +90,10 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """What is imported late."""
-    if name not in _LATER:
+    module = next((module for module, names in _LATER.items() if name in names), None)
+    if module is None:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    value = getattr(importlib.import_module(f".{_LATER[name]}", __name__), name)
+    value = getattr(importlib.import_module(f".{module}", __name__), name)
     globals()[name] = value
     return value
 

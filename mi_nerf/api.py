@@ -6,26 +6,24 @@ Mitsuba variant holds if it is one that mi_nerf works with, otherwise the best o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
-
-import mitsuba as mi
 
 from . import generation
 from .base.arrays import Image
 from .base.checks import positive, valid_seed
 from .base.errors import InputError, Option
 from .base.progress_bar import progress_bar
-from .base.variants import available_variants, choose_variant
+from .base.variants import active_variant
 from .data import Dataset
 from .scene_xml.library import find_scene
-from .tasks import describe as info
-from .tasks import evaluate as evaluation
 from .tasks import render as rendering
-from .tasks.target import Target, open_target
+from .tasks.describe import describe
+from .tasks.evaluate import evaluate, reference_image
+from .tasks.target import Target
 from .training import run as training
 from .training.config import TrainConfig, with_settings
 from .training.plain import as_text
@@ -33,19 +31,9 @@ from .training.presets import preset as preset_config
 from .training.run import Run
 from .training.run_folder import CONFIG, read_config
 
+__all__ = ["describe", "evaluate", "generate", "pictures", "render", "start"]
+
 Settings = Mapping[str, Any] | Sequence[str]
-
-
-def active_variant(requested: str | None = None) -> str:
-    """``requested``, the active Mitsuba variant, or the best one of this machine.
-
-    Raises:
-        InputError: if the requested one is not supported, or nothing is.
-    """
-    active = mi.variant()
-    if requested is None and active in available_variants():
-        return str(active)
-    return choose_variant(requested)
 
 
 def generate(
@@ -174,46 +162,6 @@ def start(
     )
 
 
-def evaluate(
-    target: str | Path | Target | Run,
-    *,
-    data: str | Path | None = None,
-    split: str = "test",
-    downscale: int | None = None,
-    views: int | None = None,
-    images: str | Path | None = None,
-    variant: str | None = None,
-    on_image: Callable[[dict[str, Any], int], None] | None = None,
-) -> dict[str, Any]:
-    """Measures held-out views by the nerf2020 protocol, as ``mi-nerf eval``.
-
-    Args:
-        target: a run or its folder, or a field file (then with ``data``).
-        data, downscale: dataset and scale; default: as the run was trained.
-        split: which views.
-        views: only so many, evenly spread.
-        images: write the rendered views to this folder, as 8-bit PNG on white.
-        on_image: called with each image's result and the number of images.
-
-    Returns:
-        The record that ``mi-nerf eval --json`` writes: ``["mean"]["psnr"]`` in dB,
-        ``["mean"]["ssim"]``, ``["images"]``, ``["seconds_per_view"]``, ``["queries_per_ray"]``.
-
-    Raises:
-        InputError: if there is no dataset to compare with, or it cannot be read.
-    """
-    return evaluation.evaluate(
-        _target(target),
-        active_variant(variant),
-        data=data,
-        split=split,
-        downscale=downscale,
-        views=views,
-        images=images,
-        on_image=on_image,
-    )
-
-
 def render(
     target: str | Path | Target | Run,
     *,
@@ -241,7 +189,7 @@ def render(
     Raises:
         InputError: if the target or its dataset cannot be read.
     """
-    source = target if isinstance(target, Target) else _path(target)
+    source = target.folder if isinstance(target, Run) else target
     count, images = rendering.frames_of(
         source, active_variant(variant), path=path, frames=frames, size=size, spp=spp
     )
@@ -255,24 +203,7 @@ def render(
 
 def pictures(dataset: Dataset) -> list[Image]:
     """The views of a dataset as :func:`evaluate` sees them: (H, W, 3) sRGB on white, 8 bits."""
-    return [evaluation.reference_image(dataset, k) for k in range(len(dataset))]
-
-
-def describe(target: str | Path | None = None) -> str:
-    """What this machine offers, or what a run, checkpoint, field or dataset holds.
-
-    Raises:
-        InputError: if the target is nothing that mi_nerf knows.
-    """
-    return info.system() if target is None else info.describe(Path(target))
-
-
-def _path(target: str | Path | Run) -> Path:
-    return target.folder if isinstance(target, Run) else Path(target)
-
-
-def _target(target: str | Path | Target | Run) -> Target:
-    return target if isinstance(target, Target) else open_target(_path(target))
+    return [reference_image(dataset, k) for k in range(len(dataset))]
 
 
 def _assignments(settings: Settings) -> list[str]:

@@ -76,7 +76,7 @@ print(mi.variant(), image.shape, (image == again).all())"""
 
 
 def test_the_active_variant_holds(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mi_nerf import api as workflow
+    from mi_nerf.base import variants as workflow
 
     monkeypatch.setattr(workflow, "available_variants", lambda: ["cuda_ad_rgb", "llvm_ad_rgb"])
     monkeypatch.setattr(workflow, "choose_variant", lambda v: v or "cuda_ad_rgb")

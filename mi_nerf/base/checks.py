@@ -15,6 +15,20 @@ def positive(name: str, value: Any) -> Any:
     return value
 
 
+def at_least_one(**values: int) -> None:
+    """InputError unless all values, of the options called so, are at least 1."""
+    for name, value in values.items():
+        if value < 1:
+            raise InputError("{}: expected at least 1", Option(name, value))
+
+
+def valid_size(size: tuple[int, int]) -> tuple[int, int]:
+    """The value of ``size``, width and height; InputError unless both are at least 1."""
+    if min(size) < 1:
+        raise InputError("{}: expected two numbers of at least 1", Option("size", size))
+    return size
+
+
 def valid_seed(value: int) -> int:
     """The value of ``seed``; InputError unless it is from 0 to 2^31 - 1."""
     if not 0 <= value < 1 << 31:

@@ -7,7 +7,7 @@ import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -55,10 +55,15 @@ def _sync(path: Path) -> None:
         os.close(handle)
 
 
+def write_text(path: str | os.PathLike[str], lines: Iterable[str]) -> None:
+    """Writes lines, each with its end."""
+    with replacing(path) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in lines))
+
+
 def write_json(path: str | os.PathLike[str], data: Any) -> None:
     """Writes ``data`` as indented JSON."""
-    with replacing(path) as temporary:
-        temporary.write_text(json.dumps(data, indent=2) + "\n")
+    write_text(path, [json.dumps(data, indent=2)])
 
 
 def read_json(path: str | os.PathLike[str], expected: str) -> Any:

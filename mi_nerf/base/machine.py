@@ -61,21 +61,26 @@ def _memory_limits(system: Path) -> Iterator[Path]:
 
 def machine(variant: str) -> dict[str, Any]:
     """What reports record of the machine; plain JSON values."""
-    import mitsuba as mi
-
-    from .._version import __version__
-
     return {
         "processor": processor(),
         "cores": cores(),
         "gpu": _gpu() if variant.startswith("cuda") else None,
         "variant": variant,
-        "versions": {
-            "mi_nerf": __version__,
-            "mitsuba": mi.__version__,
-            "drjit": dr.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": versions(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """The versions of mi_nerf and of what it computes with."""
+    import mitsuba as mi
+
+    from .._version import __version__
+
+    return {
+        "mi_nerf": __version__,
+        "mitsuba": mi.__version__,
+        "drjit": dr.__version__,
+        "python": platform.python_version(),
     }
 
 

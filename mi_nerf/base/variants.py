@@ -41,6 +41,20 @@ def choose_variant(requested: str | None = None) -> str:
     return requested or available[0]
 
 
+def active_variant(requested: str | None = None) -> str:
+    """``requested``, the active Mitsuba variant, or the best one of this machine.
+
+    Raises:
+        InputError: if the requested one is not supported, or nothing is.
+    """
+    import mitsuba as mi
+
+    active = mi.variant()
+    if requested is None and active in available_variants():
+        return str(active)
+    return choose_variant(requested)
+
+
 @contextmanager
 def using_variant(variant: str) -> Iterator[None]:
     """Sets a Mitsuba variant, and at the end the one that was set before, if any was.

@@ -33,13 +33,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.arrays import vector3_type
 from ..base.errors import InputError
-from .poses import (
-    mitsuba_from_opengl,
-)
+from .poses import mitsuba_from_opengl
 
-# --------------------------------------------------------------------------
-#   Intrinsics
-# --------------------------------------------------------------------------
+# ---- Intrinsics --------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -117,9 +113,7 @@ class Intrinsics:
         return 0.5 - self.cx / self.width, 0.5 - self.cy / self.height
 
 
-# --------------------------------------------------------------------------
-#   Rays and projection
-# --------------------------------------------------------------------------
+# ---- Rays and projection -----------------------------------------------------
 
 
 def pack_poses(c2w: ArrayLike) -> NDArray[np.float32]:
@@ -199,9 +193,7 @@ def project(
     return np.stack([x, y], axis=-1), depth
 
 
-# --------------------------------------------------------------------------
-#   Mitsuba
-# --------------------------------------------------------------------------
+# ---- Mitsuba -----------------------------------------------------------------
 
 
 def sensor_dict(

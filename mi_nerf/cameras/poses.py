@@ -7,9 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.errors import InputError
 
-# --------------------------------------------------------------------------
-#   Axis conventions
-# --------------------------------------------------------------------------
+# ---- Axis conventions --------------------------------------------------------
 
 # Changing the convention flips two of the camera's axes, that is, two columns.
 _FLIP_YZ = np.array([1.0, -1.0, -1.0, 1.0])
@@ -22,33 +20,24 @@ _RIGID_TOLERANCE = 1e-3
 
 
 def opengl_from_opencv(c2w: ArrayLike) -> NDArray[np.float64]:
-    """OpenCV camera-to-world matrices (..., 4, 4) in OpenGL's axes."""
-    return _flip(c2w, _FLIP_YZ)
-
-
-def opencv_from_opengl(c2w: ArrayLike) -> NDArray[np.float64]:
-    """OpenGL camera-to-world matrices (..., 4, 4) in OpenCV's axes."""
+    """OpenCV camera-to-world matrices (..., 4, 4) in OpenGL's axes, and the other way round."""
     return _flip(c2w, _FLIP_YZ)
 
 
 def mitsuba_from_opengl(c2w: ArrayLike) -> NDArray[np.float64]:
-    """OpenGL camera-to-world matrices (..., 4, 4) in Mitsuba's axes."""
-    return _flip(c2w, _FLIP_XZ)
-
-
-def opengl_from_mitsuba(c2w: ArrayLike) -> NDArray[np.float64]:
-    """Mitsuba camera-to-world matrices (..., 4, 4) in OpenGL's axes."""
+    """OpenGL camera-to-world matrices (..., 4, 4) in Mitsuba's axes, and the other way round."""
     return _flip(c2w, _FLIP_XZ)
 
 
 def mitsuba_from_opencv(c2w: ArrayLike) -> NDArray[np.float64]:
-    """OpenCV camera-to-world matrices (..., 4, 4) in Mitsuba's axes."""
+    """OpenCV camera-to-world matrices (..., 4, 4) in Mitsuba's axes, and the other way round."""
     return _flip(c2w, _FLIP_XY)
 
 
-def opencv_from_mitsuba(c2w: ArrayLike) -> NDArray[np.float64]:
-    """Mitsuba camera-to-world matrices (..., 4, 4) in OpenCV's axes."""
-    return _flip(c2w, _FLIP_XY)
+# A flip undoes itself.
+opencv_from_opengl = opengl_from_opencv
+opengl_from_mitsuba = mitsuba_from_opengl
+opencv_from_mitsuba = mitsuba_from_opencv
 
 
 def _flip(c2w: ArrayLike, signs: NDArray[np.float64]) -> NDArray[np.float64]:

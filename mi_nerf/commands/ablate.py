@@ -12,7 +12,7 @@ from ..base.variants import choose_variant
 from ..tasks.ablate import ROWS, ablate, table
 from ..training.config import with_settings
 from ..training.presets import preset
-from .shared import Variant, positive
+from .shared import Variant, budget, positive
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,7 @@ class Ablate:
         """Trains and evaluates all rows."""
         config = with_settings(preset(self.preset), list(self.set))
         config = replace(config, downscale=positive("downscale", self.downscale))
-        if self.steps is None:
-            seconds = 300.0 if self.max_seconds is None else self.max_seconds
-            config = replace(config, max_seconds=positive("max_seconds", seconds))
-        else:
-            config = replace(config, steps=positive("steps", self.steps))
+        config = replace(config, **budget(self.max_seconds, self.steps, usual=300.0))
         if self.views is not None:
             positive("views", self.views)
         record = ablate(

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..base.errors import InputError
+from ..base.checks import valid_size
 from ..base.variants import choose_variant
 from ..scene_xml.library import scenes
 from ..tasks.render import check_output, frames_of, output_kind, write_frames
@@ -50,10 +50,8 @@ class Render:
         for name in ("frames", "spp"):
             if getattr(self, name) is not None:
                 positive(name, getattr(self, name))
-        if self.size is not None and min(self.size) < 1:
-            raise InputError(
-                f"--size {self.size[0]} {self.size[1]}: expected two numbers of at least 1"
-            )
+        if self.size is not None:
+            valid_size(self.size)
         check_output(self.out, self.frames or 1)
         count, images = frames_of(
             self._target(),

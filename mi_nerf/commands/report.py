@@ -16,7 +16,7 @@ from ..report import Knobs, report, report_training, rows_of
 from ..report.curves_text import conclusions
 from ..report.profile import summary
 from ..report.subject import RAYS
-from .shared import Variant, name_and_value, positive, progress_bar, valid_seed
+from .shared import Variant, budget, name_and_value, positive, progress_bar, valid_seed
 
 _KNOBS = Knobs()
 
@@ -158,16 +158,10 @@ class Report:
     def _train(self, data: Path, out: Path) -> None:
         vary = dict(name_and_value(v, "--vary") for v in self.vary)
         rows = rows_of(self.presets, {k: v.split(",") for k, v in vary.items()}, self.set)
-        if self.steps is not None:
-            budget: dict[str, Any] = {"steps": positive("steps", self.steps)}
-        else:
-            seconds = 60.0 if self.max_seconds is None else self.max_seconds
-            budget = {"max_seconds": positive("max_seconds", seconds)}
+        end = budget(self.max_seconds, self.steps, usual=60.0)
         scale = positive("downscale", 1 if self.downscale is None else self.downscale)
-        rows = {
-            name: replace(config, seed=self.seed, downscale=scale, **budget)
-            for name, config in rows.items()
-        }
+        end |= {"seed": self.seed, "downscale": scale}
+        rows = {name: replace(config, **end) for name, config in rows.items()}
         record = report_training(
             data,
             out,

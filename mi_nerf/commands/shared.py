@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import arg
 
@@ -10,7 +10,7 @@ from ..base.checks import positive, valid_seed
 from ..base.errors import InputError, Option
 from ..base.progress_bar import progress_bar
 
-__all__ = ["Variant", "flag", "name_and_value", "positive", "progress_bar", "valid_seed"]
+__all__ = ["Variant", "budget", "flag", "name_and_value", "positive", "progress_bar", "valid_seed"]
 
 Variant = Annotated[
     str | None, arg(help="Mitsuba variant; default: CUDA where it works, LLVM otherwise.")
@@ -28,6 +28,13 @@ def flag(option: Option) -> str:
         return name
     values = option.value if isinstance(option.value, tuple) else (option.value,)
     return " ".join([name, *(f"{v:g}" if isinstance(v, float) else str(v) for v in values)])
+
+
+def budget(max_seconds: float | None, steps: int | None, usual: float) -> dict[str, Any]:
+    """The settings of a training's end: ``steps``, or else seconds, ``usual`` by default."""
+    if steps is not None:
+        return {"steps": positive("steps", steps)}
+    return {"max_seconds": positive("max_seconds", usual if max_seconds is None else max_seconds)}
 
 
 def name_and_value(text: str, option: str = "--set") -> tuple[str, str]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..base.box import Box
 from ..base.color import ColorSpace
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..images.read import Progress
 from . import blender, llff
 from .dataset import Dataset, evenly_spread_indices
@@ -25,6 +25,7 @@ __all__ = [
     "evenly_spread_indices",
     "held_out_split",
     "load_dataset",
+    "split_to_measure",
 ]
 
 
@@ -76,6 +77,20 @@ def available_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:
             f"{folder}: expected a dataset with transforms_{{train,val,test}}.json or {llff.POSES}"
         )
     return splits
+
+
+def split_to_measure(path: str | os.PathLike[str], split: str | None = None) -> str:
+    """``split``, or else the split to measure on.
+
+    Raises:
+        InputError: The folder does not exist or is no dataset, or has training views alone.
+    """
+    found = split or held_out_split(path)
+    if found is None:
+        raise InputError(
+            "{}: has training views alone, expected {}", path, Option("split", "train")
+        )
+    return found
 
 
 def held_out_split(path: str | os.PathLike[str]) -> str | None:

@@ -1,23 +1,28 @@
-"""The files of a dataset: what each view writes, and what describes them all."""
+"""The files of a dataset: what each view writes, and what describes them all.
+
+Forward-facing captures also have the layout of LLFF (Mildenhall et al. 2019).
+"""
 
 from __future__ import annotations
 
 import hashlib
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..base.files import write_json
+from ..base.files import make_folder, replacing, write_json
 from ..cameras.pinhole import Intrinsics
 from ..images.write import write_exr, write_picture
-from .llff import poses_bounds, write_llff
 from .noise import estimate, mean_image
 from .plan import Plan, View
 from .protocol import SPLITS
 from .surfaces import depth_bounds
 from .tracer import TracedView
+
+Array = np.ndarray[Any, Any]
 
 
 def write_view(folder: Path, view: View, traced: TracedView, plan: Plan) -> dict[str, Any]:
@@ -68,14 +73,34 @@ def write_transforms(folder: Path, plan: Plan) -> None:
 
 
 def write_forward_capture(folder: Path, plan: Plan, entries: dict[str, Any]) -> None:
-    """Writes ``poses_bounds.npy`` and ``images/``, which readers of LLFF expect."""
+    """Writes ``poses_bounds.npy`` and, in its order, ``images/``: the layout of LLFF."""
     known = [entry["depth_bounds"] for entry in entries.values() if entry["depth_bounds"]]
     everywhere = (min(b[0] for b in known), max(b[1] for b in known))
     bounds = [entries[view.name]["depth_bounds"] or everywhere for view in plan.views]
-    rows = poses_bounds(
-        np.array([view.pose for view in plan.views]), plan.intrinsics, np.array(bounds)
-    )
-    write_llff(folder, [_with(folder / view.name, ".png") for view in plan.views], rows)
+    poses = np.array([view.pose for view in plan.views])
+    make_folder(folder / "images")
+    for i, view in enumerate(plan.views):
+        with replacing(folder / "images" / f"view_{i:03d}.png") as temporary:
+            shutil.copyfile(_with(folder / view.name, ".png"), temporary)
+    with replacing(folder / "poses_bounds.npy") as temporary:
+        np.save(temporary, poses_bounds(poses, plan.intrinsics, np.array(bounds)))
+
+
+def poses_bounds(poses: Array, intrinsics: Intrinsics, bounds: Array) -> Array:
+    """The rows of ``poses_bounds.npy``, (N, 17).
+
+    A row is the 3×5 matrix [R | t | (height, width, focal)] row by row, then the near and
+    far z-depth. The columns of R are the camera's down, right and backward axes.
+
+    Args:
+        poses: OpenGL camera-to-world matrices, (N, 4, 4).
+        bounds: Near and far z-depth of each view, (N, 2).
+    """
+    right, up, back, origin = (poses[:, :3, i] for i in range(4))
+    film = np.array([intrinsics.height, intrinsics.width, intrinsics.fx])
+    film = np.broadcast_to(film, origin.shape)
+    matrix = np.stack([-up, right, back, origin, film], axis=-1)
+    return np.concatenate([matrix.reshape(-1, 15), bounds], axis=1)
 
 
 def _frame(view: View) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.checks import positive, valid_size
 from ..base.errors import InputError, Option
 from ..cameras.pinhole import Intrinsics
 from ..cameras.poses import look_at, opengl_from_mitsuba
@@ -79,7 +80,7 @@ class Plan:
     @property
     def scale(self) -> float:
         """A length that is typical of the scene."""
-        return max(_extent(self.box), self.radius)
+        return max(float(np.linalg.norm(np.subtract(*self.box))), self.radius)
 
     def of_split(self, split: str) -> list[View]:
         """The views of one split."""
@@ -136,7 +137,7 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
     """
     name = protocol_name(file, options)
     counts = _counts(name, options)
-    size = _size(options.size or PROTOCOLS[name].size)
+    size = valid_size(options.size or PROTOCOLS[name].size)
     sensor = scene.sensors()[0] if file.plugins("Sensor") else None
     spp = options.spp
     if spp is None:
@@ -223,7 +224,7 @@ def _forward(
         spread = _own_spread(file)
     if spread is None:
         spread = _SPREAD * _nearest(scene, intrinsics, pose)
-    _require_radius(spread)
+    positive("radius", spread)
     poses = viewpoints.forward(sum(counts.values()), options.seed, pose, spread)
     views = _hold_out(poses, counts, options.seed)
     return _Shots("forward", intrinsics, views, pose[:3, 3], spread)
@@ -249,13 +250,7 @@ def _center_and_radius(box: Bounds, options: Options) -> tuple[Array, float]:
     radius = RADIUS * reach if options.radius is None else options.radius
     if not np.isfinite(center).all():
         raise InputError("{}: expected three finite numbers", Option("center", options.center))
-    _require_radius(radius)
-    return center, radius
-
-
-def _require_radius(radius: float) -> None:
-    if not 0 < radius < math.inf:
-        raise InputError("{}: expected a number above 0", Option("radius", radius))
+    return center, positive("radius", radius)
 
 
 def halves(spp: int) -> tuple[int, int]:
@@ -279,12 +274,6 @@ def _counts(name: str, options: Options) -> dict[str, int]:
         # Every eighth of all: one in seven of the training views, rounded up.
         counts["test"] = -(-counts["train"] // (HOLD_OUT - 1))
     return counts
-
-
-def _size(size: tuple[int, int]) -> tuple[int, int]:
-    if min(size) < 1:
-        raise InputError("{}: expected two numbers of at least 1", Option("size", size))
-    return size
 
 
 def _sampler_spp(sensor: Any) -> int:
@@ -373,7 +362,3 @@ def _triple(values: Array) -> tuple[float, float, float]:
 
 def _numbers(values: tuple[float, float, float]) -> str:
     return "(" + ", ".join(f"{v:.3g}" for v in values) + ")"
-
-
-def _extent(box: Bounds) -> float:
-    return float(np.linalg.norm(np.subtract(box[1], box[0])))

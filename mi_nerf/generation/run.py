@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import platform
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from .._version import __version__
 from ..base.errors import InputError, Option
 from ..base.files import check_folder, make_folder, read_json, write_json
 from ..base.interrupts import interruptible
+from ..base.machine import versions
 from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
 from ..scene_xml.scene_file import SceneFile, visible_bounds
@@ -163,9 +162,6 @@ def _check_sampler(sampler: Any, plan: Plan) -> None:
 
 def _describe(file: SceneFile, plan: Plan, variant: str) -> dict[str, Any]:
     """The record of a dataset without any view."""
-    import drjit as dr
-    import mitsuba as mi
-
     return {
         "format": "mi_nerf.dataset",
         "version": VERSION,
@@ -178,13 +174,7 @@ def _describe(file: SceneFile, plan: Plan, variant: str) -> dict[str, Any]:
         },
         "settings": plan.record(),
         "variant": variant,
-        "versions": {
-            "mi_nerf": __version__,
-            "mitsuba": mi.__version__,
-            "drjit": dr.__version__,
-            "numpy": np.__version__,
-            "python": platform.python_version(),
-        },
+        "versions": {**versions(), "numpy": np.__version__},
         "noise": {},
         "views": {},
     }

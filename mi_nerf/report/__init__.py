@@ -23,9 +23,8 @@ Quality against seconds of training::
 from .curves import rows_of, training_curves
 from .curves_text import conclusions as training_conclusions
 from .curves_text import plot_curves
-from .pareto import pareto_front
 from .run import load, report, report_training
-from .speed import Knobs, sweep
+from .speed import Knobs, pareto_front, sweep
 from .speed_plot import plot_speed
 from .speed_text import choose, conclusions, describe
 from .subject import Subject, open_subject

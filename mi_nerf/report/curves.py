@@ -5,18 +5,18 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..base.checks import at_least_one
 from ..base.errors import InputError, Option
-from ..base.files import make_folder, read_json, replacing, write_json
+from ..base.files import read_json, write_text
 from ..base.machine import machine
-from ..data import held_out_split, load_dataset
+from ..data import load_dataset, split_to_measure
 from ..tasks.evaluate import evaluate
-from ..tasks.series import check_same, mean, trained
+from ..tasks.series import all_trained, mean, trained
 from ..tasks.target import Target
 from ..training.config import TrainConfig, setting_names, to_json, with_settings
 from ..training.presets import preset
@@ -95,14 +95,8 @@ def training_curves(
     Raises:
         InputError: if the data cannot be read, or the folder holds something else.
     """
-    for name, value in (("seeds", seeds), ("views", views), ("looks", looks)):
-        if value < 1:
-            raise InputError("{}: expected at least 1", Option(name, value))
-    split = split or held_out_split(data)
-    if split is None:
-        raise InputError(
-            "{}: has training views alone, expected {}", data, Option("split", "train")
-        )
+    at_least_one(seeds=seeds, views=views, looks=looks)
+    split = split_to_measure(data, split)
     load_dataset(data, split, limit=1)  # before hours of work
     folder = Path(out)
     settings = {
@@ -112,24 +106,18 @@ def training_curves(
         "looks": looks,
         "rows": {name: to_json(config) for name, config in rows.items()},
     }
-    check_same(folder, RECORD, settings, "a report on trainings")
     record = {"settings": settings, "machine": machine(variant), "complete": False, "rows": []}
-    make_folder(folder)
-    write_json(folder / RECORD, record)
-    results: dict[str, list[Record]] = {name: [] for name in rows}
-    for seed in range(seeds):  # whole sets first: an early end leaves something to compare
-        for name, config in rows.items():
-            wanted = replace(config, seed=config.seed + seed)
-            if on_run is not None:
-                on_run(name, wanted.seed)
-            place = folder / "runs" / _slug(name) / f"seed_{wanted.seed}"
-            watch = Watch(place, looks, lambda run: _look(run, split, views))
-            result = trained(data, place, wanted, variant, _ending, given=given, after_step=watch)
-            if result is None:
-                return _finish(folder, record, results)
-            results[name].append({**result, "seed": wanted.seed, "curve": read_curve(place)})
-    record["complete"] = True
-    return _finish(folder, record, results)
+
+    def train(name: str, config: TrainConfig) -> Record | None:
+        if on_run is not None:
+            on_run(name, config.seed)
+        place = folder / "runs" / _slug(name) / f"seed_{config.seed}"
+        watch = Watch(place, looks, lambda run: _look(run, split, views))
+        result = trained(data, place, config, variant, _ending, given=given, after_step=watch)
+        return result and {**result, "seed": config.seed, "curve": read_curve(place)}
+
+    file = folder / RECORD
+    return all_trained(record, rows, seeds, train, summary, file, "a report on trainings")
 
 
 class Watch:
@@ -152,8 +140,7 @@ class Watch:
         with run.clock_stopped():
             seen = {"look": due, "step": run.trainer.step_count, "seconds": run.seconds}
             self._lines.append({**seen, **self._look(run)})
-            with replacing(self._file) as temporary:
-                temporary.write_text("".join(json.dumps(line) + "\n" for line in self._lines))
+            write_text(self._file, map(json.dumps, self._lines))
 
 
 def read_curve(folder: Path) -> list[Record]:
@@ -189,12 +176,6 @@ def _slug(name: str) -> str:
     return "".join(c if c.isalnum() or c in "._-=" else "_" for c in name.replace(", ", "__"))
 
 
-def _finish(folder: Path, record: Record, results: Mapping[str, list[Record]]) -> Record:
-    record["rows"] = [summary(name, runs) for name, runs in results.items() if runs]
-    write_json(folder / RECORD, record)
-    return record
-
-
 def summary(name: str, runs: list[Record]) -> Record:
     """A row of the record: means of the seeds that did not fail."""
     good = [run for run in runs if run["failed"] is None and run["curve"]]
@@ -203,22 +184,14 @@ def summary(name: str, runs: list[Record]) -> Record:
         lines = [line for run in good for line in run["curve"] if line["look"] == look]
         values = [line["psnr"] for line in lines if line["psnr"] is not None]
         if values:
-            curve.append(
-                {
-                    "seconds": mean(line["seconds"] for line in lines),
-                    "psnr": mean(values),
-                    "least": min(values),
-                    "greatest": max(values),
-                    "seeds": len(values),
-                }
-            )
+            point = {"seconds": mean(line["seconds"] for line in lines), "psnr": mean(values)}
+            point |= {"least": min(values), "greatest": max(values), "seeds": len(values)}
+            curve.append(point)
     last = [run["curve"][-1] for run in good]
+    keys = ("psnr", "ssim", "queries_per_ray", "seconds")
     return {
         "name": name,
-        "psnr": mean(line["psnr"] for line in last),
-        "ssim": mean(line["ssim"] for line in last),
-        "queries_per_ray": mean(line["queries_per_ray"] for line in last),
-        "seconds": mean(line["seconds"] for line in last),
+        **{key: mean(line[key] for line in last) for key in keys},
         "parameters": mean(run["parameters"] for run in good),
         "seeds": len(runs),
         "failures": len(runs) - sum(run["failed"] is None for run in runs),

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.machine import machine_line
+from ..tasks.tables import markdown_table, number, spread, time_axis
 
 Record = dict[str, Any]
 
@@ -18,11 +19,10 @@ def conclusions(record: Record) -> list[str]:
         return ["No run has come to an end."]
     first, *others = rows
     values = _endings(first)
-    spread = f", {min(values):.2f} to {max(values):.2f}" if len(values) > 1 else ""
-    count = f"{len(values)} seed{'s' if len(values) > 1 else ''}"
+    seeds = f"{len(values)} seeds, {spread(values)}" if len(values) > 1 else "1 seed"
     result = [
         f"`{first['name']}` comes to the best end: {first['psnr']:.2f} dB after "
-        f"{first['seconds']:.0f} s ({count}{spread})."
+        f"{first['seconds']:.0f} s ({seeds})."
     ]
     for other in others:
         passed = seconds_to(first["curve"], other["psnr"])
@@ -83,29 +83,23 @@ def markdown(record: Record, figure: str) -> list[str]:
 
 
 def _table(record: Record) -> list[str]:
-    lines = [
-        "| model | PSNR (dB) | range | SSIM | train (s) | steps | queries/ray | parameters "
-        "| failures |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    head = "model|PSNR (dB)|range|SSIM|train (s)|steps|queries/ray|parameters|failures"
+    rows = []
     for row in record["rows"]:
-        values = _endings(row)
         steps = [run["steps"] for run in row["runs"] if run["failed"] is None]
         cells = [
             f"`{row['name']}`",
-            _text(row["psnr"], ".2f"),
-            f"{min(values):.2f} to {max(values):.2f}" if len(values) > 1 else "",
-            _text(row["ssim"], ".4f"),
-            _text(row["seconds"], ".0f"),
-            f"{min(steps)} to {max(steps)}"
-            if len(set(steps)) > 1
-            else ", ".join(map(str, steps[:1])),
-            _text(row["queries_per_ray"], ".1f"),
-            _text(row["parameters"], ",.0f"),
+            number(row["psnr"], ".2f"),
+            spread(_endings(row)),
+            number(row["ssim"], ".4f"),
+            number(row["seconds"], ".0f"),
+            spread(sorted(set(steps)), "d") or "".join(map(str, steps[:1])),
+            number(row["queries_per_ray"], ".1f"),
+            number(row["parameters"], ",.0f"),
             f"{row['failures']} of {row['seeds']}",
         ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
+        rows.append(cells)
+    return markdown_table(head.split("|"), rows)
 
 
 def _endings(row: Record) -> list[float]:
@@ -116,45 +110,28 @@ def _endings(row: Record) -> list[float]:
     return [value for value in last if value is not None]
 
 
-def _text(value: float | None, form: str) -> str:
-    return "n/a" if value is None else format(value, form)
-
-
 def plot_curves(record: Record) -> Any:
     """A matplotlib figure of a record of :func:`mi_nerf.report.training_curves`.
 
     Lines are means of the seeds, bands reach from the worst to the best one.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     settings = record["settings"]
     figure = Figure(figsize=(8.5, 5.2), layout="constrained")
     axes = figure.subplots()
-    for number, row in enumerate(r for r in record["rows"] if r["curve"]):
+    for k, row in enumerate(r for r in record["rows"] if r["curve"]):
         x, y, least, greatest = (
-            [p[k] for p in row["curve"]] for k in ("seconds", "psnr", "least", "greatest")
+            [p[key] for p in row["curve"]] for key in ("seconds", "psnr", "least", "greatest")
         )
-        color, count = f"C{number}", row["seeds"] - row["failures"]
+        color, count = f"C{k}", row["seeds"] - row["failures"]
         seeds = f"{count} seed{'s' if count > 1 else ''}"
         axes.plot(x, y, "o-", color=color, ms=4, label=f"{row['name']} ({seeds})")
         axes.fill_between(x, least, greatest, color=color, alpha=0.2, lw=0)
-        axes.annotate(
-            f"{y[-1]:.2f}",
-            (x[-1], y[-1]),
-            (6, -3),
-            textcoords="offset points",
-            color=color,
-            fontsize=9,
-        )
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
+        place: dict[str, Any] = {"xytext": (6, -3), "textcoords": "offset points"}
+        axes.annotate(f"{y[-1]:.2f}", (x[-1], y[-1]), color=color, fontsize=9, **place)
+    time_axis(axes, "seconds of training, compilation included")
     axes.margins(x=0.08)
-    axes.grid(which="major", color="#dddddd", lw=0.6)
-    axes.set_axisbelow(True)
-    axes.set_xlabel("seconds of training, compilation included")
     axes.set_ylabel(f"PSNR of {settings['views']} held-out views (dB)")
     axes.legend(fontsize=9)
     axes.set_title(

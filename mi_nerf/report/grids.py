@@ -16,11 +16,6 @@ Cells = NDArray[np.bool_]
 _LOOKS, _MOST_LOOKS = 32, 1 << 21  # at random points of each cell, unless there are too many
 
 
-def own_resolution(grid: OccupancyGrid | None) -> int | None:
-    """Cells along the longest side, of a grid that there is."""
-    return None if grid is None else max(grid.shape)
-
-
 class Grids:
     """Looks at a field once for each resolution, and draws the line at any threshold."""
 

@@ -12,10 +12,10 @@ import drjit as dr
 import numpy as np
 
 from ..base.errors import InputError
-from ..base.files import replacing
 from ..base.kernel_stages import Launch, recording
 from ..base.variants import array_module
 from ..data import load_dataset
+from ..tasks.tables import markdown_table, save_figure
 from ..tasks.target import Target
 from ..training.checkpoint import load_checkpoint
 from ..training.run_folder import CHECKPOINT, read_config
@@ -132,6 +132,7 @@ def profile_steps(
         plain.append(stopwatch.plain_round(count))
     kernels = [sum(k.milliseconds for k in r.launches) for r in profiled]
     typical = profiled[int(np.argsort(kernels)[len(kernels) // 2])]
+    parts = [part_of_step(launch) for launch in typical.launches]
     milliseconds = [r.milliseconds for r in plain]
     step_ms = float(np.median(milliseconds))
     return StepProfile(
@@ -142,7 +143,7 @@ def profile_steps(
         slowest_ms=max(milliseconds),
         profiled_ms=typical.milliseconds,
         stages=stage_times(typical.launches, count, step_ms),
-        launches=_launch_counts(typical.launches, count),
+        launches={name: parts.count(name) / count for name in LABELS},
         compiled=sum(k.compiled for r in profiled for k in r.launches),
         rays=float(np.mean([r.rays for r in plain])),
         queries=float(np.mean([r.queries for r in plain])),
@@ -173,11 +174,6 @@ def stage_times(launches: list[Launch], steps: int, step_ms: float) -> dict[str,
     scale = min(1.0, step_ms / kernels) if kernels > 0 else 1.0
     parts = {name: scale * ms for name, ms in parts.items()}
     return parts | {"python": step_ms - scale * kernels}
-
-
-def _launch_counts(launches: list[Launch], steps: int) -> dict[str, float]:
-    parts = [part_of_step(launch) for launch in launches]
-    return {name: parts.count(name) / steps for name in LABELS}
 
 
 class _Stopwatch:
@@ -240,7 +236,13 @@ def markdown(record: dict[str, Any]) -> list[str]:
     limits, step_ms = record["product_gflops"], record["step_ms"]
     shares = {name: 100 * record["gflops"] / limit for name, limit in limits.items()}
     launched = sum(record["launches"].values())
-    lines = [
+    stages = [(text, record["stages"][k], record["launches"][k]) for k, text in LABELS.items()]
+    stages.append(("a step", sum(record["stages"].values()), launched))
+    rows = [
+        (label, f"{spent:.2f}", f"{100 * spent / step_ms:.1f} %", f"{count:.1f}")
+        for label, spent, count in stages
+    ]
+    return [
         f"A step takes {step_ms:.2f} ms, the median of {record['rounds']} rounds of "
         f"{record['round_steps']} steps ({record['fastest_ms']:.2f} to "
         f"{record['slowest_ms']:.2f} ms), each step waited for.",
@@ -257,15 +259,7 @@ def markdown(record: dict[str, Any]) -> list[str]:
         "",
         f"![Time of a step by stages]({FIGURE})",
         "",
-        "| stage | ms | share | launches |",
-        "|---|---|---|---|",
-    ]
-    for name, label in LABELS.items():
-        spent, count = record["stages"][name], record["launches"][name]
-        lines.append(f"| {label} | {spent:.2f} | {100 * spent / step_ms:.1f} % | {count:.1f} |")
-    total = sum(record["stages"].values())
-    lines += [
-        f"| a step | {total:.2f} | {100 * total / step_ms:.1f} % | {launched:.1f} |",
+        *markdown_table(("stage", "ms", "share", "launches"), rows),
         "",
         "Stages are measured on the device, by the times of their kernels, in other steps, in",
         f"which each stage waits for its kernels ({record['profiled_ms']:.2f} ms a step). A kernel",
@@ -276,7 +270,6 @@ def markdown(record: dict[str, Any]) -> list[str]:
         "step does here, as on a busy machine, they are scaled to fit. Neither padding of the last",
         "block nor queries of the occupancy grid count as arithmetic.",
     ]
-    return lines
 
 
 def draw(path: Path, record: dict[str, Any]) -> None:
@@ -293,5 +286,4 @@ def draw(path: Path, record: dict[str, Any]) -> None:
     axes.margins(x=0.12)
     axes.set_xlabel("ms a step")
     axes.spines[["top", "right"]].set_visible(False)
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(path, figure)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..base.errors import InputError, Option
-from ..base.files import check_folder, make_folder, read_json, replacing, write_json
+from ..base.files import check_folder, make_folder, read_json, write_json, write_text
 from ..base.machine import machine
 from ..data import load_dataset
+from ..tasks.tables import markdown_table, save_figure
 from ..tasks.target import Target, open_target
 from ..training.config import TrainConfig
 from . import curves_text, speed_text
@@ -68,15 +70,12 @@ def report(
     """
     check_folder(out)
     subject = open_field(target, variant, values=values)
-    seen = None
     if knobs is not None:
         seen = open_subject(target, variant, values=values, data=data, **rays)
-    opened = None
-    if not subject.formula:
-        opened = target if isinstance(target, Target) else open_target(target)
+    opened = None if subject.formula else open_target(target)
     places, no_places = _places(opened, subject, points, data)
     speed = None
-    if seen is not None:
+    if knobs is not None:
         speed = sweep(seen, knobs, repeats=repeats, on_render=on_render)
     folder = make_folder(out)
     record: dict[str, Any] = {
@@ -92,19 +91,21 @@ def report(
         "step_left_out": None if profile else "not asked for",
     }
     if speed is not None:
-        _save(plot_speed(speed), folder / SPEED_FIGURE)
+        save_figure(folder / SPEED_FIGURE, plot_speed(speed))
     if places is not None:
         record["view_dependence"] = draw_view_dependence(
             folder / FIGURE, subject.field, places, variant
         )
     if profile:
         try:
-            record["step"] = _profile(opened, subject, variant, on_step)
+            if opened is None:
+                raise InputError(f"{subject.name}: a formula, which is not trained")
+            record["step"] = step_profile.profile_run(opened, variant, on_step)
             step_profile.draw(folder / step_profile.FIGURE, record["step"])
         except InputError as error:
             record["step_left_out"] = str(error)
     write_json(folder / RECORD, record)
-    _write(folder / TEXT, _markdown(record))
+    write_text(folder / TEXT, _markdown(record))
     return record
 
 
@@ -118,8 +119,8 @@ def report_training(
     """
     record = training_curves(data, out, rows, variant, **options)
     folder = Path(out)
-    _save(curves_text.plot_curves(record), folder / CURVES_FIGURE)
-    _write(folder / TEXT, curves_text.markdown(record, CURVES_FIGURE))
+    save_figure(folder / CURVES_FIGURE, curves_text.plot_curves(record))
+    write_text(folder / TEXT, curves_text.markdown(record, CURVES_FIGURE))
     return record
 
 
@@ -137,14 +138,6 @@ def load(folder: str | Path) -> dict[str, Any]:
     if not isinstance(record, dict) or not ("speed" in record or "rows" in record):
         raise InputError(f"{path}: expected the record of a report")
     return record
-
-
-def _profile(
-    target: Target | None, subject: Subject, variant: str, on_step: Callable[[], object] | None
-) -> dict[str, Any]:
-    if target is None:
-        raise InputError(f"{subject.name}: a formula, which is not trained")
-    return step_profile.profile_run(target, variant, on_step)
 
 
 def _places(
@@ -176,52 +169,33 @@ def _places(
     return found, None
 
 
-def _save(figure: Any, path: Path) -> None:
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=150)
-
-
-def _write(path: Path, lines: list[str]) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n")
-
-
 # ---- report.md -------------------------------------------------------------------
 
 
 def _markdown(record: dict[str, Any]) -> list[str]:
     lines = [f"# Report on {record['target']}", ""]
     lines += [f"- {sentence}" for sentence in record["conclusions"]]
-    lines += ["", "## Speed against error", ""]
-    if record["speed"] is None:
-        lines.append(f"Left out: {record['speed_left_out']}.")
-    else:
-        lines += speed_text.markdown(record["speed"], SPEED_FIGURE)
-    lines += ["", "## View dependence", ""]
-    if record["view_dependence"]:
-        lines += _view_dependence(record["view_dependence"])
-    else:
-        lines.append(f"Left out: {record['view_dependence_left_out']}.")
-    lines += ["", "## Where a step's time goes", ""]
-    if record["step"] is None:
-        lines.append(f"Left out: {record['step_left_out']}.")
-    else:
-        lines += step_profile.markdown(record["step"])
+    for key, title, section in (
+        ("speed", "Speed against error", partial(speed_text.markdown, figure=SPEED_FIGURE)),
+        ("view_dependence", "View dependence", _view_dependence),
+        ("step", "Where a step's time goes", step_profile.markdown),
+    ):
+        left_out = [f"Left out: {record[f'{key}_left_out']}."]
+        lines += ["", f"## {title}", "", *(section(record[key]) if record[key] else left_out)]
     return lines
 
 
 def _view_dependence(entries: list[dict[str, Any]]) -> list[str]:
-    lines = [
+    rows = []
+    for entry in entries:
+        cells = [", ".join(f"{v:.2f}" for v in entry[k]) for k in ("point", "normal", "color")]
+        rows.append([*cells, f"{entry['deviation']:.3f}"])
+    return [
         "Colour that leaves a point towards every direction of the hemisphere around its normal,",
         "seen from above (NeRF, Fig. 3). The deviation is the root mean square over directions of",
         "display values; 0 means that the point looks the same from everywhere.",
         "",
         f"![Emission over directions]({FIGURE})",
         "",
-        "| point | normal | mean colour | deviation |",
-        "|---|---|---|---|",
+        *markdown_table(("point", "normal", "mean colour", "deviation"), rows),
     ]
-    for entry in entries:
-        cells = [", ".join(f"{v:.2f}" for v in entry[k]) for k in ("point", "normal", "color")]
-        lines.append(f"| {' | '.join(cells)} | {entry['deviation']:.3f} |")
-    return lines

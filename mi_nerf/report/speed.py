@@ -12,8 +12,9 @@ errors are told apart:
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, get_args
 
@@ -26,8 +27,7 @@ from ..march.marched import MarchedField
 from ..march.render import render_rays
 from ..march.rules import Rule
 from ..march.settings import MarchSettings
-from .grids import Grids, own_resolution
-from .pareto import pareto_front
+from .grids import Grids
 from .subject import Subject
 
 Array = np.ndarray[Any, Any]
@@ -143,7 +143,7 @@ def sweep(
                 seen[setting] = found
             notify(total)
     points = [
-        {"knobs": names, **_description(s), **_timing(times[s]), **_errors(subject, seen[s], exact)}
+        {"knobs": names, **_description(s, times[s]), **_errors(subject, seen[s], exact)}
         for s, names in settings.items()
     ]
     by = "depth" if subject.formula and record["error"]["depth"] is not None else "color"
@@ -188,7 +188,8 @@ def settings_of(subject: Subject, knobs: Knobs) -> dict[Setting, list[str]]:
         add("split", Setting(replace(march, samples=samples, fine=fine)))
     for stop in knobs.stops:
         add("stop", Setting(replace(march, stop=stop)))
-    middle = own_resolution(subject.marched.occupancy) or _RESOLUTION
+    grid = subject.marched.occupancy
+    middle = _RESOLUTION if grid is None else max(grid.shape)
     for resolution in knobs.resolutions:
         add("resolution", Setting(march, (resolution, _THRESHOLD)))
     for threshold in knobs.thresholds:
@@ -210,17 +211,13 @@ def _render(subject: Subject, marched: MarchedField) -> tuple[float, Seen]:
     return elapsed, Seen(color, opacity, depth, found.queries / subject.rays)
 
 
-def _description(setting: Setting) -> dict[str, Any]:
+def _description(setting: Setting, seconds: list[float]) -> dict[str, Any]:
+    """What was set, and how long it took."""
     march, grid = setting.march, setting.grid
+    times = [1e3 * s for s in seconds]
     return {
         **{name: getattr(march, name) for name in ("samples", "fine", "rule", "stop")},
         "grid": None if grid is None else {"resolution": grid[0], "threshold": grid[1]},
-    }
-
-
-def _timing(seconds: list[float]) -> dict[str, float]:
-    times = [1e3 * s for s in seconds]
-    return {
         "milliseconds": float(np.median(times)),
         "fastest": min(times),
         "slowest": max(times),
@@ -239,6 +236,26 @@ def _errors(subject: Subject, seen: Seen, exact: Reference) -> dict[str, Any]:
         },
         "psnr": subject.psnr(shown),
     }
+
+
+def pareto_front(costs: Sequence[float], errors: Sequence[float]) -> list[bool]:
+    """Marks the points for which no other is as cheap and as exact, and better in one of both.
+
+    Equal points are marked alike. NaN in either number leaves a point out.
+
+    >>> pareto_front([1, 2, 3, 3], [0.5, 0.2, 0.3, 0.1])
+    [True, True, False, True]
+    """
+    pairs = enumerate(zip(costs, errors, strict=True))
+    usable = [i for i, pair in pairs if not any(map(math.isnan, pair))]
+    marked = [False] * len(costs)
+    best = float("inf")  # least error among cheaper points
+    cost_of_best = float("-inf")
+    for i in sorted(usable, key=lambda i: (costs[i], errors[i])):
+        if errors[i] < best:
+            best, cost_of_best = errors[i], costs[i]
+        marked[i] = errors[i] == best and costs[i] == cost_of_best
+    return marked
 
 
 def _mark_front(points: list[dict[str, Any]], by: str, floor: float) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..base.machine import machine_line
+from ..tasks.tables import time_axis
 from .speed_text import WORDS
 
 Record = dict[str, Any]
@@ -22,6 +23,7 @@ _KNOBS = {  # marker, colour, what it is
     "resolution": ("s", "#8c6d31", "grid of another resolution"),
     "threshold": ("D", "#c05fa8", "grid of another threshold"),
 }
+_NOTE: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8}
 
 
 def plot_speed(record: Record) -> Any:
@@ -47,7 +49,7 @@ def plot_speed(record: Record) -> Any:
         _known(right, reference["error"]["depth"])
         right.set_ylabel("quadrature error of the depth\nroot mean square, scene units")
     for axes in (left, right):
-        _time_axis(axes, record["rays"])
+        time_axis(axes, f"milliseconds for {record['rays']:,} rays")
     handles, labels = left.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=9)
     figure.suptitle(
@@ -71,7 +73,8 @@ def _panel(axes: Any, record: Record, value: Value, *, named: bool = True) -> No
         if named and rule == record["points"][0]["rule"]:
             for point in curve:
                 fine = f"+{point['fine']}" if point["fine"] else ""
-                _note(axes, f"{point['samples']}{fine}", *_places([point], value), color)
+                text, place = f"{point['samples']}{fine}", (point["milliseconds"], value(point))
+                axes.annotate(text, place, (-4, -11), color=color, ha="right", **_NOTE)
     for knob, (marker, color, label) in _KNOBS.items():
         some = [p for p in points if knob in p["knobs"] and "own" not in p["knobs"]]
         if some:
@@ -88,11 +91,6 @@ def _places(points: list[dict[str, Any]], value: Value) -> tuple[list[float], li
     return [p["milliseconds"] for p in points], [value(p) for p in points]
 
 
-def _note(axes: Any, text: str, x: list[float], y: list[Any], color: str) -> None:
-    place = {"xytext": (-4, -11), "textcoords": "offset points", "ha": "right"}
-    axes.annotate(text, (x[0], y[0]), fontsize=8, color=color, **place)
-
-
 def _known(axes: Any, floor: float | None) -> None:
     """Makes an axis of errors, and shades what the reference cannot tell."""
     axes.set_yscale("log")
@@ -101,15 +99,8 @@ def _known(axes: Any, floor: float | None) -> None:
         return
     axes.axhspan(bottom, floor, color="#eeeeee", zorder=0)
     if floor > 2 * bottom:  # else there is no room for words
-        axes.annotate(
-            "below what the reference states as its own error",
-            (0.01, floor),
-            (0, -11),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            fontsize=8,
-            color="#666666",
-        )
+        text, axis = "below what the reference states as its own error", ("axes fraction", "data")
+        axes.annotate(text, (0.01, floor), (0, -11), xycoords=axis, color="#666666", **_NOTE)
     axes.set_ylim(bottom, top)
 
 
@@ -118,15 +109,3 @@ def _model(axes: Any, psnr: float) -> None:
     label = f"perfect quadrature: {psnr:.2f} dB, the model error alone"
     line = axes.axhline(psnr, color="k", lw=0.9, ls=(0, (6, 3)), zorder=1)
     axes.legend([line], [label], loc="lower right", fontsize=9)
-
-
-def _time_axis(axes: Any, rays: int) -> None:
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_xlabel(f"milliseconds for {rays:,} rays")
-    axes.grid(which="major", color="#dddddd", lw=0.6)
-    axes.set_axisbelow(True)

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..base.errors import InputError
 from ..base.machine import machine_line
+from ..tasks.tables import markdown_table
 
 Record = dict[str, Any]
 Point = dict[str, Any]
@@ -239,7 +240,7 @@ def _table(record: Record, points: list[Point]) -> list[str]:
     depth = record["reference"]["error"]["depth"] is not None
     head = ["setting", "ms", "queries/ray", "colour error"]
     head += ["depth error"] * depth + ["PSNR (dB)"] * images
-    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    rows = []
     for point in points:
         cells = [
             describe(point) + (" (own)" if "own" in point["knobs"] else ""),
@@ -253,8 +254,8 @@ def _table(record: Record, points: list[Point]) -> list[str]:
             cells.append("∞" if point["psnr"] is None else f"{point['psnr']:.2f}")
         if point["pareto"]:
             cells[:2] = [f"**{cell}**" for cell in cells[:2]]
-        lines.append(f"| {' | '.join(cells)} |")
-    return lines
+        rows.append(cells)
+    return markdown_table(head, rows)
 
 
 def _how_to_read(record: Record) -> list[str]:

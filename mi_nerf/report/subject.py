@@ -7,19 +7,20 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import drjit as dr
 import numpy as np
 
 from ..base.arrays import upload, vector3_type
+from ..base.checks import at_least_one
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError, Option
 from ..base.variants import array_module
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from ..cameras.trajectory import orbit
-from ..data import held_out_split
-from ..fields.closed_form import CLOSED_FORMS, ClosedFormField, closed_form
+from ..data import split_to_measure
+from ..fields.closed_form import CLOSED_FORMS, closed_form
 from ..fields.protocol import Field
 from ..images.metrics import to_8bit
 from ..march.marched import MarchedField
@@ -31,9 +32,9 @@ Array = np.ndarray[Any, Any]
 
 RAYS = 10_000  # a view of 100x100 pixels has as many
 
-# Cameras around fields that come without any: views, pixels across, angle in radians, and
-# the sine of their elevation.
-_VIEWS, _SIZE, _ANGLE, _HEIGHT = 8, 100, 0.7, 0.4
+# Cameras around fields that come without any: pixels across, angle in radians, and the sine
+# of their elevation.
+_SIZE, _ANGLE, _HEIGHT = 100, 0.7, 0.4
 
 
 @dataclass(frozen=True)
@@ -134,9 +135,7 @@ def open_subject(
     Raises:
         InputError: if the target is none of these, or its images cannot be read.
     """
-    for name, value in (("rays", rays), ("views", views)):
-        if value < 1:
-            raise InputError("{}: expected at least 1", Option(name, value))
+    at_least_one(rays=rays, views=views)
     opened = _opened(target)
     subject = open_field(opened, variant, values=values)
     if isinstance(opened, str):
@@ -157,8 +156,11 @@ def open_field(
     backend = array_module(variant)
     opened = _opened(target)
     if isinstance(opened, str):
-        formula = MarchedField(_formula(opened, values or {}, backend), MarchSettings())
-        return Subject(opened, True, formula, backend, variant)
+        try:
+            field = closed_form(opened, values or {}, backend.TensorXf)
+        except ValueError as error:
+            raise InputError(f"{opened}: {error}") from error
+        return Subject(opened, True, MarchedField(field, MarchSettings()), backend, variant)
     if values:
         raise InputError("{}: {} is no formula", Option("values", next(iter(values))), opened.path)
     return Subject(str(opened.path), False, opened.contents.marched(backend), backend, variant)
@@ -178,19 +180,11 @@ def _opened(target: Target | str | Path) -> Target | str:
     return open_target(target)
 
 
-@dataclass(frozen=True)
-class _Cameras:
+class _Cameras(NamedTuple):
     film: Intrinsics
     poses: Array  # (V, 4, 4)
     truth: Array | None  # (V, H, W, 3)
     origin: dict[str, Any]
-
-
-def _formula(kind: str, values: Mapping[str, Any], backend: Any) -> ClosedFormField:
-    try:
-        return closed_form(kind, values, backend.TensorXf)
-    except ValueError as error:
-        raise InputError(f"{kind}: {error}") from error
 
 
 def _cameras(
@@ -205,11 +199,7 @@ def _cameras(
     folder = target.data if data is None else Path(data)
     if folder is None:
         return _around(field, views)
-    split = split or held_out_split(folder)
-    if split is None:
-        raise InputError(
-            "{}: has training views alone, expected {}", folder, Option("split", "train")
-        )
+    split = split_to_measure(folder, split)
     images = held_out(target, data, split, downscale, views)
     truth = np.stack([reference_image(images, k) for k in range(len(images))])
     origin = {"data": str(folder), "split": images.split}

@@ -10,12 +10,12 @@ import numpy as np
 
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError, Option
-from ..base.files import replacing
 from ..base.variants import array_module
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from ..fields.protocol import Field
 from ..march.marched import MarchedField
 from ..march.render import render_rays
+from ..tasks.tables import save_figure
 
 Array = np.ndarray[Any, Any]
 
@@ -147,8 +147,7 @@ def draw_view_dependence(
                 "deviation": deviation,
             }
         )
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(path, figure)
     return records
 
 

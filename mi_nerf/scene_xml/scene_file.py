@@ -130,15 +130,6 @@ class SceneFile:
                 resolver.append(folder)
 
 
-def load_scene(path: str | Path) -> Any:
-    """Loads Mitsuba XML as it is.
-
-    Raises:
-        InputError: if the file is missing or Mitsuba refuses it.
-    """
-    return SceneFile(path).load()
-
-
 def visible_bounds(scene: Any) -> Bounds | None:
     """The corners of the box around all shapes that are no light sources; None without any."""
     corners = []

@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..base.errors import InputError
-from ..base.files import make_folder, replacing, write_json
+from ..base.files import write_text
 from ..fields.fourier import FourierEncoding
 from ..training.config import TrainConfig, to_json
 from ..training.run import Run
 from .evaluate import evaluate
-from .series import check_same, mean, trained
-from .target import open_target
+from .series import all_trained, mean, trained
+from .tables import markdown_table, number, save_figure, spread
 
 RECORD, TABLE, FIGURE = "ablation.json", "ablation.md", "ablation.png"
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One line of the table: what is changed of the complete model."""
 
-    name: str
     title: str
     change: Callable[[TrainConfig], TrainConfig]
 
@@ -80,22 +78,17 @@ def _views(count: int) -> Callable[[TrainConfig], TrainConfig]:
 
 
 ROWS = {
-    row.name: row
-    for row in (
-        Row(
-            "no-pe-vd-h",
-            "No PE, VD, H",
-            lambda c: _no_hierarchy(_no_view_dependence(_no_encoding(c))),
-        ),
-        Row("no-pe", "No positional encoding", _no_encoding),
-        Row("no-vd", "No view dependence", _no_view_dependence),
-        Row("no-h", "No hierarchical sampling", _no_hierarchy),
-        Row("25-images", "Far fewer images (25)", _views(25)),
-        Row("50-images", "Fewer images (50)", _views(50)),
-        Row("l5", "Fewer frequencies (L = 5)", _octaves(5)),
-        Row("l15", "More frequencies (L = 15)", _octaves(15)),
-        Row("complete", "Complete model", lambda c: c),
-    )
+    "no-pe-vd-h": Row(
+        "No PE, VD, H", lambda c: _no_hierarchy(_no_view_dependence(_no_encoding(c)))
+    ),
+    "no-pe": Row("No positional encoding", _no_encoding),
+    "no-vd": Row("No view dependence", _no_view_dependence),
+    "no-h": Row("No hierarchical sampling", _no_hierarchy),
+    "25-images": Row("Far fewer images (25)", _views(25)),
+    "50-images": Row("Fewer images (50)", _views(50)),
+    "l5": Row("Fewer frequencies (L = 5)", _octaves(5)),
+    "l15": Row("More frequencies (L = 15)", _octaves(15)),
+    "complete": Row("Complete model", lambda c: c),
 }
 
 
@@ -131,29 +124,24 @@ def ablate(
     base = complete(config)
     settings: dict[str, Any] = {"data": str(Path(data).resolve()), "split": split, "views": views}
     settings["base"] = to_json(base)
-    record = {"settings": settings, "complete": False, "rows": []}
-    check_same(folder, RECORD, settings, "an ablation")
-    make_folder(folder)
-    write_json(folder / RECORD, record)
-    results: dict[str, list[dict[str, Any]]] = {name: [] for name in rows}
-    for seed in range(seeds):  # whole tables first: an early end leaves something to compare
-        for name in rows:
-            wanted = replace(ROWS[name].change(base), seed=base.seed + seed)
-            print(f"{name}, seed {wanted.seed}", flush=True)
-            place = folder / name / f"seed_{wanted.seed}"
-            measure = partial(_quality, settings=settings, variant=variant)
-            result = trained(data, place, wanted, variant, measure)
-            if result is None:
-                return _write(folder, record, results)
-            results[name].append(result)
-    record["complete"] = True
-    return _write(folder, record, results)
+    record: dict[str, Any] = {"settings": settings, "complete": False, "rows": []}
+
+    def train(name: str, config: TrainConfig) -> dict[str, Any] | None:
+        print(f"{name}, seed {config.seed}", flush=True)
+        measure = partial(_quality, settings=settings, variant=variant)
+        return trained(data, folder / name / f"seed_{config.seed}", config, variant, measure)
+
+    configs = {name: ROWS[name].change(base) for name in rows}
+    all_trained(record, configs, seeds, train, _summary, folder / RECORD, "an ablation")
+    write_text(folder / TABLE, table(record).splitlines())
+    if any(row["psnr"] is not None for row in record["rows"]):
+        _draw(folder / FIGURE, record)
+    return record
 
 
 def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]:
     """What the table says of a finished run."""
-    target = open_target(run.folder)
-    found = evaluate(target, variant, split=settings["split"], views=settings["views"])
+    found = evaluate(run.folder, variant, split=settings["split"], views=settings["views"])
     names = ("queries_per_ray", "parameters", "views", "size")
     return {**found["mean"], "train_seconds": run.seconds, **{n: found[n] for n in names}}
 
@@ -161,56 +149,32 @@ def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]
 # ---- Table and figure --------------------------------------------------------
 
 
-def _write(
-    folder: Path, record: dict[str, Any], results: dict[str, list[dict[str, Any]]]
-) -> dict[str, Any]:
-    record["rows"] = [
-        {"name": name, "title": ROWS[name].title, **_summary(runs), "runs": runs}
-        for name, runs in results.items()
-        if runs
-    ]
-    write_json(folder / RECORD, record)
-    with replacing(folder / TABLE) as temporary:
-        temporary.write_text(table(record))
-    if any(row["psnr"] is not None for row in record["rows"]):
-        _draw(folder / FIGURE, record)
-    return record
-
-
-def _summary(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Means over the runs that did not fail."""
+def _summary(name: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    """A row of the record: means over the runs that did not fail."""
     good = [run for run in runs if run["failed"] is None]
     keys = ("psnr", "ssim", "train_seconds", "queries_per_ray", "parameters")
     means = {key: mean(run[key] for run in good) for key in keys}
-    return {**means, "seeds": len(runs), "failures": len(runs) - len(good)}
+    counts = {"seeds": len(runs), "failures": len(runs) - len(good)}
+    return {"name": name, "title": ROWS[name].title, **means, **counts, "runs": runs}
 
 
 def table(record: dict[str, Any]) -> str:
     """The rows as Markdown."""
-    lines = [
-        "| | PSNR (dB) | range | SSIM | train (s) | queries/ray | parameters | failures |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
-    for row in record["rows"]:
-        values = [run["psnr"] for run in row["runs"] if run["failed"] is None]
-        numbers = [v for v in values if v is not None]
-        spread = f"{min(numbers):.2f} to {max(numbers):.2f}" if len(numbers) > 1 else ""
-        cells = [
+    head = "|PSNR (dB)|range|SSIM|train (s)|queries/ray|parameters|failures"
+    rows = [
+        [
             row["title"],
-            _text(row["psnr"], ".2f"),
-            spread,
-            _text(row["ssim"], ".4f"),
-            _text(row["train_seconds"], ".0f"),
-            _text(row["queries_per_ray"], ".1f"),
-            _text(row["parameters"], ",.0f"),
+            number(row["psnr"], ".2f"),
+            spread([run["psnr"] for run in row["runs"] if run.get("psnr") is not None]),
+            number(row["ssim"], ".4f"),
+            number(row["train_seconds"], ".0f"),
+            number(row["queries_per_ray"], ".1f"),
+            number(row["parameters"], ",.0f"),
             f"{row['failures']} of {row['seeds']}",
         ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def _text(value: float | None, form: str) -> str:
-    return "n/a" if value is None else format(value, form)
+        for row in record["rows"]
+    ]
+    return "\n".join(markdown_table(head.split("|"), rows)) + "\n"
 
 
 def _draw(path: Path, record: dict[str, Any]) -> None:
@@ -231,5 +195,4 @@ def _draw(path: Path, record: dict[str, Any]) -> None:
     axes.invert_yaxis()
     axes.set_xlim(left=min(row["psnr"] for row in rows) - 3)
     axes.set_xlabel("PSNR (dB), mean of seeds; points: each seed")
-    with replacing(path) as temporary:
-        figure.savefig(temporary, dpi=150)
+    save_figure(path, figure)

@@ -12,14 +12,13 @@ import imageio.v3 as iio
 import numpy as np
 
 from ..base.errors import InputError
-from ..base.files import make_folder, replacing, write_json
+from ..base.files import make_folder, replacing, write_json, write_text
 from ..data import load_dataset
 from ..generation import Options, generate
 from ..scene_xml.library import find_scene
 from ..training import run as training
 from ..training.presets import preset
 from .evaluate import evaluate, quality, reference_image
-from .target import open_target
 
 SCENE = "arches"
 
@@ -60,11 +59,11 @@ def run_demo(
     spent = run.seconds
     print("3/4  evaluating held-out views")
     with tempfile.TemporaryDirectory() as pictures:
-        record = evaluate(open_target(folder / "run"), variant, split="test", images=pictures)
+        record = evaluate(folder / "run", variant, split="test", images=pictures)
         write_json(folder / "eval.json", record)
         print("4/4  drawing the comparison")
         _draw_comparison(folder, Path(pictures))
-    _write_scene(folder / "scene.xml", size)
+    write_text(folder / "scene.xml", _SCENE_XML.format(size=4 * size).splitlines())
     print(
         f"\nheld-out {quality(record)} after {spent:.0f} s of training; "
         f"{time.monotonic() - clock:.0f} s in all\n"
@@ -97,11 +96,6 @@ def _draw_comparison(folder: Path, pictures: Path) -> None:
     picture = np.kron(picture, np.ones((2, 2, 1)))
     with replacing(folder / "comparison.png") as path:
         iio.imwrite(path, np.rint(picture * 255).astype(np.uint8), extension=".png")
-
-
-def _write_scene(path: Path, size: int) -> None:
-    with replacing(path) as temporary:
-        temporary.write_text(_SCENE_XML.format(size=4 * size))
 
 
 _SCENE_XML = """<scene version="3.0.0">

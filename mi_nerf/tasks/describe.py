@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import os
-import platform
 from pathlib import Path
 from typing import Any
 
-import drjit as dr
-
-from .._version import __version__
 from ..base.errors import InputError
 from ..base.files import read_json
+from ..base.machine import versions
 from ..base.tensor_file import read_metadata
 from ..base.variants import available_variants
 from ..data import available_splits, load_dataset
@@ -25,14 +22,9 @@ from ..training.run_folder import CHECKPOINT, CONFIG, FIELD, read_record
 
 def system() -> str:
     """Versions, the compiler, and the variants that work here."""
-    import mitsuba as mi
-
     variants = available_variants()
     rows = {
-        "mi_nerf": __version__,
-        "mitsuba": mi.__version__,
-        "drjit": dr.__version__,
-        "python": platform.python_version(),
+        **versions(),
         "cores": str(os.cpu_count()),
         "LLVM library": os.environ.get("DRJIT_LIBLLVM_PATH", "left to Dr.Jit"),
         "variants": ", ".join(variants) or "none works on this machine",
@@ -41,12 +33,15 @@ def system() -> str:
     return _table(rows)
 
 
-def describe(path: Path) -> str:
-    """What lies at ``path``.
+def describe(target: str | Path | None = None) -> str:
+    """What this machine offers, or what a run, checkpoint, field or dataset holds.
 
     Raises:
-        InputError: if it is nothing that mi_nerf knows.
+        InputError: if the target is nothing that mi_nerf knows.
     """
+    if target is None:
+        return system()
+    path = Path(target)
     if not path.exists():
         raise InputError(
             f"{path}: not found, expected a run, a .safetensors file or a dataset folder"

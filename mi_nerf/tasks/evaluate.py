@@ -16,19 +16,22 @@ import imageio.v3 as iio
 import numpy as np
 
 from ..base.arrays import Image
+from ..base.checks import at_least_one
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError, Option
 from ..base.files import make_folder, replacing
-from ..base.variants import array_module
+from ..base.variants import active_variant, array_module
 from ..data import Dataset, load_dataset
 from ..images.metrics import psnr, ssim, to_8bit
 from ..march.view import display_image, render_view
-from .target import Target
+from ..training.run import Run
+from .tables import number
+from .target import Target, open_target
 
 
 def evaluate(
-    target: Target,
-    variant: str,
+    target: str | Path | Target | Run,
+    variant: str | None = None,
     *,
     data: str | Path | None = None,
     split: str = "test",
@@ -37,23 +40,27 @@ def evaluate(
     images: str | Path | None = None,
     on_image: Callable[[dict[str, Any], int], None] | None = None,
 ) -> dict[str, Any]:
-    """Renders held-out views and measures them against the dataset.
+    """Measures held-out views by the nerf2020 protocol, as ``mi-nerf eval``.
 
     Args:
-        data, downscale: default to those of the run.
-        views: only so many views, evenly spread over the split.
-        images: a folder for the rendered views, as 8-bit PNG on white.
+        target: a run or its folder, or a field file (then with ``data``).
+        data, downscale: dataset and scale; default: as the run was trained.
+        split: which views.
+        views: only so many, evenly spread.
+        images: write the rendered views to this folder, as 8-bit PNG on white.
         on_image: called with each image's result and the number of images.
 
     Returns:
-        The record that ``mi-nerf eval --json`` writes.
+        The record that ``mi-nerf eval --json`` writes: ``["mean"]["psnr"]`` in dB,
+        ``["mean"]["ssim"]``, ``["images"]``, ``["seconds_per_view"]``, ``["queries_per_ray"]``.
 
     Raises:
         InputError: if there is no dataset to compare with, or it cannot be read.
     """
+    target = open_target(target)
     dataset = held_out(target, data, split, downscale, views)
     folder = None if images is None else make_folder(images)
-    backend = array_module(variant)
+    backend = array_module(active_variant(variant))
     marched = target.contents.marched(backend)
     results: list[dict[str, Any]] = []
     qualities: list[dict[str, float]] = []
@@ -64,7 +71,8 @@ def evaluate(
         seconds.append(time.perf_counter() - start)
         queries += view.queries
         predicted = to_8bit(display_image(view, marched.field.color_space))
-        figures = _compare(predicted, reference_image(dataset, k))
+        truth = reference_image(dataset, k)
+        figures = {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
         qualities.append(figures)
         result = {"name": name, **{key: _finite(value) for key, value in figures.items()}}
         results.append(result)
@@ -93,10 +101,7 @@ def evaluate(
 def quality(record: dict[str, Any]) -> str:
     """The mean PSNR and SSIM of a record of :func:`evaluate`, for people."""
     psnr_mean, ssim_mean = record["mean"]["psnr"], record["mean"]["ssim"]
-    return (
-        f"PSNR {'n/a' if psnr_mean is None else format(psnr_mean, '.2f')} dB, "
-        f"SSIM {'n/a' if ssim_mean is None else format(ssim_mean, '.4f')}"
-    )
+    return f"PSNR {number(psnr_mean, '.2f')} dB, SSIM {number(ssim_mean, '.4f')}"
 
 
 def reference_image(dataset: Dataset, index: int) -> Image:
@@ -117,11 +122,8 @@ def held_out(
     Raises:
         InputError: if there are none, or they are not of the kind it was trained on.
     """
-    if views is not None and views < 1:
-        raise InputError("{}: expected at least 1", Option("views", views))
     scale = target.downscale if downscale is None else downscale
-    if scale < 1:
-        raise InputError("{}: expected at least 1", Option("downscale", scale))
+    at_least_one(views=1 if views is None else views, downscale=scale)
     path = Path(data) if data is not None else target.data
     if path is None:
         raise InputError(
@@ -153,10 +155,6 @@ def _require_same_projection(target: Target, dataset: Dataset) -> None:
         raise InputError(
             f"{dataset.path}: {theirs}, expected about {ours} as {target.path} was trained with"
         )
-
-
-def _compare(predicted: Image, truth: Image) -> dict[str, float]:
-    return {"psnr": psnr(predicted, truth), "ssim": ssim(predicted, truth)}
 
 
 def _mean(values: list[float]) -> float | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Generator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,16 +13,18 @@ import imageio.v2 as imageio
 import numpy as np
 
 from ..base.arrays import Image
+from ..base.checks import valid_size
 from ..base.color import srgb_to_linear
 from ..base.errors import InputError, Option
 from ..base.files import check_file, check_folder, make_folder, replacing
 from ..base.variants import array_module, using_variant
 from ..cameras.pinhole import Intrinsics
-from ..cameras.trajectory import Poses, forward_spiral, orbit_like, spiral_like
+from ..cameras.poses import mitsuba_from_opengl, opengl_from_mitsuba
+from ..cameras.trajectory import Poses, forward_spiral, orbit, orbit_like, spiral_like
 from ..data import Dataset, held_out_split, load_dataset
 from ..images.write import on_white, write_picture
 from ..march.view import render_view
-from ..scene_xml.scene_file import load_scene
+from ..scene_xml.scene_file import SceneFile
 from .target import Target, open_target
 
 Path_ = Literal["orbit", "spiral", "test"]
@@ -134,37 +137,9 @@ def scene_frames(
         InputError: if the scene cannot be loaded or has no sensor.
     """
 
-    def produce() -> Generator[Any, None, None]:
-        with using_variant(variant):
-            count, images = _scene_frames(scene_path, path, frames, size, spp)
-            yield count
-            yield from images
-
-    produced = produce()
-    return next(produced), produced
-
-
-def _scene_frames(
-    scene_path: str | Path,
-    path: Path_ | None,
-    frames: int,
-    size: tuple[int, int] | None,
-    spp: int,
-) -> tuple[int, Frames]:
-    """As :func:`scene_frames`, with the active variant."""
     import mitsuba as mi
 
-    scene = load_scene(scene_path)
-    sensors = scene.sensors()
-    if not sensors:
-        raise InputError(f"{scene_path}: has no sensor, expected at least one")
-    if size is not None:
-        for sensor in sensors:
-            film = mi.traverse(sensor)
-            film["film.size"] = list(size)
-            film.update()
-
-    def render(sensor: Any, seed: int = 0) -> Image:
+    def render(scene: Any, sensor: Any, seed: int = 0) -> Image:
         try:
             return _rgba(mi.render(scene, sensor=sensor, spp=spp, seed=seed), sensor.film())
         except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
@@ -172,15 +147,32 @@ def _scene_frames(
                 raise InputError(f"{scene_path}: {error.__cause__}") from error
             raise
 
-    def still() -> Frames:
-        for i, sensor in enumerate(sensors):
-            yield f"sensor_{i:03d}", render(sensor)
+    def produce() -> Generator[Any, None, None]:
+        """The number of frames, and then these."""
+        with using_variant(variant):
+            scene = SceneFile(scene_path).load()
+            sensors = scene.sensors()
+            if not sensors:
+                raise InputError(f"{scene_path}: has no sensor, expected at least one")
+            if path == "test":
+                expected = "{}: a scene has no test views, expected {} or {}"
+                raise InputError(expected, scene_path, *_MOVING)
+            if size is not None:
+                for sensor in sensors:
+                    film = mi.traverse(sensor)
+                    film["film.size"] = list(size)
+                    film.update()
+            draw = partial(render, scene)
+            if path is not None:
+                yield frames
+                yield from _moving(scene, sensors[0], path, frames, draw)
+                return
+            yield len(sensors)
+            for i, sensor in enumerate(sensors):
+                yield f"sensor_{i:03d}", draw(sensor)
 
-    if path is None:
-        return len(sensors), still()
-    if path == "test":
-        raise InputError("{}: a scene has no test views, expected {} or {}", scene_path, *_MOVING)
-    return frames, _moving(scene, sensors[0], path, frames, render)
+    produced = produce()
+    return next(produced), produced
 
 
 def write_frames(
@@ -296,17 +288,16 @@ def _resized(intrinsics: Intrinsics, size: tuple[int, int] | None) -> Intrinsics
     """The same horizontal field of view on a film of another size."""
     if size is None:
         return intrinsics
-    if min(size) < 1:
-        raise InputError("{}: expected two numbers of at least 1", Option("size", size))
-    scale = size[0] / intrinsics.width
+    width, height = valid_size(size)
+    scale = width / intrinsics.width
     return replace(
         intrinsics,
-        width=size[0],
-        height=size[1],
+        width=width,
+        height=height,
         fx=intrinsics.fx * scale,
         fy=intrinsics.fy * scale,
         cx=intrinsics.cx * scale,
-        cy=intrinsics.cy * size[1] / intrinsics.height,
+        cy=intrinsics.cy * height / intrinsics.height,
     )
 
 
@@ -336,8 +327,6 @@ def _moving(
     """Moves a sensor around the scene's box, at its own distance and height."""
     import mitsuba as mi
 
-    from ..cameras.poses import mitsuba_from_opengl, opengl_from_mitsuba
-
     parameters = mi.traverse(sensor)
     start = opengl_from_mitsuba(np.array(parameters["to_world"].matrix, np.float64).reshape(4, 4))
     center = np.array(scene.bbox().center(), np.float64).ravel()
@@ -352,8 +341,6 @@ def _moving(
 
 def _aim(pose: Image, center: Image) -> Image:
     """A ring of cameras like ``pose`` that all look at ``center``."""
-    from ..cameras.trajectory import orbit
-
     offset = pose[:3, 3] - center
     radius = float(np.linalg.norm(offset))
     strongest = int(np.argmax(np.abs(pose[:3, 1])))

@@ -2,20 +2,59 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import InputError
-from ..base.files import read_json, write_json
+from ..base.files import make_folder, read_json, write_json
 from ..training import run as training
 from ..training.config import TrainConfig
 from ..training.run import Run, TrainingError
 from ..training.run_folder import CONFIG, read_config
 
 RESULT = "eval.json"
+
+
+def all_trained(
+    record: dict[str, Any],
+    rows: Mapping[str, TrainConfig],
+    seeds: int,
+    train: Callable[[str, TrainConfig], dict[str, Any] | None],
+    summary: Callable[[str, list[dict[str, Any]]], dict[str, Any]],
+    file: Path,
+    what: str,
+) -> dict[str, Any]:
+    """``record`` with the results of every row, trained with every seed from its own on.
+
+    Args:
+        train: gives the result of the row of that name and seed, or ``None`` if interrupted.
+        summary: of all results of a row.
+        file: holds the record, ``complete`` once nothing is missing.
+        what: it is a record of, e.g. "an ablation".
+
+    Raises:
+        InputError: if the folder of the file holds something else.
+    """
+    check_same(file.parent, file.name, record["settings"], what)
+    make_folder(file.parent)
+    write_json(file, record)
+    results: dict[str, list[dict[str, Any]]] = {name: [] for name in rows}
+    record["complete"] = True
+    # Whole sets first: an early end leaves something to compare.
+    for seed, name in itertools.product(range(seeds), rows):
+        result = train(name, replace(rows[name], seed=rows[name].seed + seed))
+        if result is None:
+            record["complete"] = False
+            break
+        results[name].append(result)
+    record["rows"] = [summary(name, runs) for name, runs in results.items() if runs]
+    write_json(file, record)
+    return record
 
 
 def check_same(folder: Path, record_name: str, settings: dict[str, Any], what: str) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 from ..base.errors import InputError
 from ..formats.field_file import FieldFile, load_field
+from ..training.run import Run
 from ..training.run_folder import CONFIG, FIELD, LOG, read_record
 
 
@@ -44,13 +45,15 @@ class Target:
             return None
 
 
-def open_target(path: str | Path) -> Target:
-    """Opens a run folder or a field file.
+def open_target(path: str | Path | Target | Run) -> Target:
+    """Opens a run, given by its folder or as such, or a field file; a target is taken as it is.
 
     Raises:
         InputError: if it is neither, or has no field yet.
     """
-    target = Path(path)
+    if isinstance(path, Target):
+        return path
+    target = path.folder if isinstance(path, Run) else Path(path)
     if target.is_dir():
         if not (target / CONFIG).exists():
             raise InputError(f"{target}: no {CONFIG} in it, expected the folder of a run")

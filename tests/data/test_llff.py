@@ -14,7 +14,7 @@ from mi_nerf.base.errors import InputError
 from mi_nerf.cameras.pinhole import Intrinsics, project
 from mi_nerf.cameras.poses import average_pose
 from mi_nerf.data import available_splits, load_dataset
-from mi_nerf.generation.llff import poses_bounds
+from mi_nerf.generation.output import poses_bounds
 from tests.support.datasets import (
     forward_poses,
     orbit_poses,
