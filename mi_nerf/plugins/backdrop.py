@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -231,11 +229,9 @@ def _class_name(integrator: Any) -> str:
     return name if name in _REPLAYED else str(integrator.class_name())
 
 
-@contextmanager
-def _differentiable_loops() -> Iterator[None]:
+def _differentiable_loops() -> Any:
     """Loops step by step: recorded ones of Mitsuba's C++ integrators have no adjoint."""
-    with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
-        yield
+    return dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False)
 
 
 def _backward(values: list[Any], gradients: list[Any]) -> None:
