@@ -58,11 +58,9 @@ class _Live:
 
     def keep(self, where: Indices) -> _Live:
         """Those in the slots ``where``."""
-        ray, t, through, random = (
-            dr.gather(type(v), v, where) for v in (self.ray, self.t, self.through, self.random)
-        )
-        dr.eval(ray, t, through, random)
-        return _Live(ray, t, through, random)
+        kept = dr.gather(_Live, self, where)
+        dr.eval(kept)
+        return kept
 
 
 def track(

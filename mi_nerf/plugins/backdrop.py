@@ -148,7 +148,6 @@ class Surfaces(Backdrop):
         return light
 
     def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
-        """Carries gradients of the radiance to the parameters of surfaces and lights."""
         if not self._differentiable():
             return
         pull = mi.Color3f(*gradients) * (1 / self._paths)
@@ -164,7 +163,6 @@ class Surfaces(Backdrop):
             dr.eval()
 
     def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
-        """The derivative of the radiance along the gradients of surfaces and lights."""
         total = dr.zeros(mi.Color3f, dr.width(ray))
         if not self._differentiable():
             return list(total)

@@ -218,6 +218,9 @@ class FieldIntegrator(ADIntegrator):
                 dr.forward_to(image)
                 return dr.grad(image)
 
+    def _unlike(self, name: str, value: Any, expected: str) -> InputError:
+        return InputError(f"{self.plugin}: {name}={value}, expected {expected}")
+
     def _require_derivatives(self) -> None:
         if not self.differentiable:
             raise InputError(

@@ -38,9 +38,6 @@ class MarchingIntegrator(FieldIntegrator):
             raise self._unlike(name, value, f"{least} or more")
         return value
 
-    def _unlike(self, name: str, value: Any, expected: str) -> InputError:
-        return InputError(f"{self.plugin}: {name}={value}, expected {expected}")
-
     def _settings(self) -> str:
         """For ``to_string``."""
         return (

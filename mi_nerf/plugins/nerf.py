@@ -133,18 +133,17 @@ class NerfIntegrator(MarchingIntegrator):
     @staticmethod
     def _find_nested(props: mi.Properties) -> Any:
         """The integrator among the properties, or ``None``."""
-        found = [(key, props[key]) for key in props.unqueried()]
-        found = [(key, value) for key, value in found if isinstance(value, mi.Integrator)]
+        values = [props[key] for key in props.unqueried()]
+        found = [value for value in values if isinstance(value, mi.Integrator)]
         if len(found) > 1:
             raise InputError(f"nerf: {len(found)} nested integrators, expected at most one")
-        for _, nested in found:
+        for nested in found:
             if isinstance(nested, FieldIntegrator):
                 raise InputError(
                     f"nerf: '{nested.plugin}' nested in 'nerf', expected one like 'path' or 'prb'"
                 )
             check_nested(nested)
-            return nested
-        return None
+        return found[0] if found else None
 
     def traverse(self, callback: Any) -> None:
         """Exposes the nested integrator."""

@@ -125,9 +125,7 @@ class NerfTrackingIntegrator(FieldIntegrator):
         self.encoded = bool(props.get("encoded", False))
         self.majorant = props.get("majorant", None)
         if self.majorant is not None and not 0 < self.majorant < math.inf:
-            raise InputError(
-                f"nerf_tracking: majorant={self.majorant}, expected a finite number above 0"
-            )
+            raise self._unlike("majorant", self.majorant, "a finite number above 0")
 
     def to_string(self) -> str:
         """Lists the settings."""
