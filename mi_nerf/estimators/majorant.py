@@ -69,12 +69,8 @@ class Majorants:
         )
         densities = np.where(cells, grid.values(), 0)
         densities = np.maximum(densities, 0.5 * greatest_around(densities))
-        return cls(
-            field.lower,
-            field.upper,
-            np.where(cells, np.maximum(densities, least_majorant(field)), 0),
-            float_type,
-        )
+        densities = np.maximum(densities, least_majorant(field))
+        return cls(field.lower, field.upper, np.where(cells, densities, 0), float_type)
 
     def values(self) -> np.ndarray[Any, Any]:
         """(X, Y, Z) densities, 1/scene unit."""

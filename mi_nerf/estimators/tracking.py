@@ -17,7 +17,7 @@ finite as long as σ̄ > 0 where σ > 0. A weak T ends by Russian roulette.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -58,11 +58,9 @@ class _Live:
 
     def keep(self, where: Indices) -> _Live:
         """Those in the slots ``where``."""
-        ray, t, through, random = (
-            dr.gather(type(v), v, where) for v in (self.ray, self.t, self.through, self.random)
-        )
-        dr.eval(ray, t, through, random)
-        return _Live(ray, t, through, random)
+        kept = dr.gather(_Live, self, where)
+        dr.eval(kept)
+        return kept
 
 
 def track(
@@ -90,7 +88,7 @@ def track(
         color = [dr.zeros(float_type, rays) for _ in range(3)]
         remaining = dr.ones(float_type, rays)
         dr.make_opaque(color, remaining)
-        ask, queries = _Asker(field, block), 0
+        ask, queries = _asker(field, block), 0
         for live, majorant, cell in _collisions(segments, majorants, random, rays):
             density, emission = ask(segments, live)
             queries += len(live.ray)
@@ -175,32 +173,27 @@ def _roulette(live: _Live) -> None:
     live.through = dr.select(weak, strengthened, live.through)
 
 
-class _Asker:
+def _asker(field: Field, block: int) -> Callable[[RaySegments, _Live], tuple[Floats, list[Floats]]]:
     """Density and emission where rays collide, in blocks that compile once."""
+    fused = field.fused()
+    ask = fused or field.density_emission
 
-    def __init__(self, field: Field, block: int) -> None:
-        self._fused = field.fused()
-        self._ask = self._fused or field.density_emission
-        self._block = block
+    def query(segments: RaySegments, live: _Live) -> tuple[Floats, list[Floats]]:
+        p = points_along(segments.o, segments.d, live.t, live.ray)
+        density, emission = ask(p, gather_vector3(segments.view, live.ray))
+        dr.eval(density, emission)
+        return density, emission
 
-    def __call__(self, segments: RaySegments, live: _Live) -> tuple[Floats, list[Floats]]:
-        count = len(live.ray)
-        if self._fused is not None:
-            return self._query(segments, live)
-        float_type, uint = type(live.t), type(live.ray)
+    def in_blocks(segments: RaySegments, live: _Live) -> tuple[Floats, list[Floats]]:
+        count, float_type, uint = len(live.ray), type(live.t), type(live.ray)
         outputs = [dr.zeros(float_type, count) for _ in range(4)]
-        for start, size in ranges(count, self._block, _SMALL_BLOCK):
+        for start, size in ranges(count, block, _SMALL_BLOCK):
             slot = dr.arange(uint, size) + dr.opaque(uint, start)
             valid = slot < dr.opaque(uint, count)
-            where = dr.select(valid, slot, 0)
-            density, emission = self._query(segments, live.keep(where))
+            density, emission = query(segments, live.keep(dr.select(valid, slot, 0)))
             for output, value in zip(outputs, (density, *emission), strict=True):
                 dr.scatter(output, value, slot, valid)
             dr.eval(outputs)
         return outputs[0], outputs[1:]
 
-    def _query(self, segments: RaySegments, live: _Live) -> tuple[Floats, list[Floats]]:
-        p = points_along(segments.o, segments.d, live.t, live.ray)
-        density, emission = self._ask(p, gather_vector3(segments.view, live.ray))
-        dr.eval(density, emission)
-        return density, emission
+    return in_blocks if fused is None else query

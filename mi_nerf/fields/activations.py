@@ -35,13 +35,9 @@ def bounded_exp(x: Floats) -> Floats:
     """exp(x) up to x = 15, its tangent line beyond."""
     inside = dr.exp(dr.select(x < _MAX_EXPONENT, x, _MAX_EXPONENT))
     beyond = relu(x - _MAX_EXPONENT)
-    return inside * (1 + dr.detach(beyond)) + _tangent_gradient(beyond)
-
-
-def _tangent_gradient(beyond: Floats) -> Floats:
-    """Zero in value; carries the slope exp(15) of the tangent."""
-    scaled = beyond * math.exp(_MAX_EXPONENT)
-    return scaled - dr.detach(scaled)
+    value = inside * (1 + dr.detach(beyond))
+    slope = beyond * math.exp(_MAX_EXPONENT)
+    return value + (slope - dr.detach(slope))  # 0, which carries the slope of the tangent
 
 
 def sigmoid(x: Floats) -> Floats:

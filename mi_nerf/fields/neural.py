@@ -166,7 +166,6 @@ class NeuralField(Field):
         return {name: np.array(tensor) for name, tensor in self._weights.items()}
 
     def density(self, p: Vectors) -> Floats:
-        """σ at N points, in 1/scene unit."""
         raw = network.density_head(self.config.network, self._weights, self._trunk(p))
         return self._density(raw, p)
 

@@ -7,11 +7,7 @@ from typing import Any
 import drjit as dr
 
 from ..base.arrays import Floats, Indices
-from .strata import (
-    stratified,
-)
-
-# ---- Hierarchical sampling (NeRF Sec. 5.2) -----------------------------------
+from .strata import stratified
 
 # Added to every weight before they are normalised, as in the code of the paper: bins that
 # the coarse network sees as empty stay reachable, and weights that are all 0 mean "anywhere".

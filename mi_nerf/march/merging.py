@@ -25,6 +25,7 @@ from .importance import count_below
 from .query import Evaluation
 from .rules import sample_weights
 from .samples import Samples
+from .strata import rows
 
 # No row, or no sample: where a ray misses a field.
 _NONE = 0xFFFFFFFF
@@ -155,9 +156,7 @@ class _Ends:
         dr.make_opaque(self.asked)
         if len(layer.evaluation.asked):
             dr.scatter(self.asked, dr.mask_t(layer.edges)(True), layer.evaluation.asked)
-        index = dr.arange(uint, len(self._edges))
-        row = index // self._stride
-        number = index - row * self._stride  # of the end in its row
+        row, number = rows(uint, len(self._edges), self._stride)  # of each end
         after = row * samples.count + number
         kept = dr.gather(dr.mask_t(layer.edges), self.asked, after, number < samples.count)
         kept |= dr.gather(dr.mask_t(layer.edges), self.asked, after - 1, number > 0)

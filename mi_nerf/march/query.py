@@ -150,6 +150,9 @@ class Evaluation:
         gradients = [dr.grad(channel) for channel in self._channels]
         with stage("compositing"):  # its adjoint
             dr.eval(gradients)
+        samples, leaves = self._samples, list(self._field.parameters().values())
+        moving = (samples.o, samples.d, samples.view, samples.t)
+        leaves += [value for value in moving if dr.grad_enabled(value)]
         kept = self._graph or ((w, v, None) for w, v in self._blocks(self.asked, self._block))
         with _private_sums():
             for where, valid, outputs in kept:
@@ -161,14 +164,8 @@ class Evaluation:
                         dr.enqueue(dr.ADMode.Backward, value)
                 dr.traverse(dr.ADMode.Backward)
                 with stage("encoding_adjoint"):
-                    dr.eval([dr.grad(leaf) for leaf in self._leaves()])
+                    dr.eval([dr.grad(leaf) for leaf in leaves])
         self._graph = []
-
-    def _leaves(self) -> list[Any]:
-        """All that gradients are added up for."""
-        samples = self._samples
-        moving = [v for v in (samples.o, samples.d, samples.view, samples.t) if dr.grad_enabled(v)]
-        return [*self._field.parameters().values(), *moving]
 
     def forward(self) -> None:
         """Fills the gradients of density and emission from those that :meth:`backward` adds to."""

@@ -25,14 +25,7 @@ from typing import Any, Literal
 import drjit as dr
 
 from ..base.arrays import Floats
-from .strata import (
-    cell_edges,
-    cell_widths,
-    half_widths,
-    neighbours,
-    stratified,
-    stratum_edges,
-)
+from .strata import cell_edges, cell_widths, half_widths, neighbours, stratified, stratum_edges
 
 Rule = Literal["constant", "cells", "linear"]
 
@@ -153,14 +146,11 @@ def linear_weights(
     transmittance is exact at both ends of the half, and the light emitted linear in it.
     Weights are not negative and sum to the opacity, which is that of the rule ``cells``.
 
+    Arguments and results as in :func:`sample_weights`, besides:
+
     Args:
-        density: R·S values ≥ 0, in 1/unit of ``t``.
         t: R·S ascending parameters.
         near, far: bounds of R rays.
-        samples: S.
-
-    Returns:
-        ``(weights, opacity)``, R·S and R values.
     """
     density = dr.select(density > _MAX_DENSITY, _MAX_DENSITY, density)
     below, above = half_widths(t, near, far, samples)

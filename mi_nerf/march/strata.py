@@ -7,9 +7,18 @@ their directions first, as :func:`mi_nerf.cameras.pinhole` does.
 
 from __future__ import annotations
 
+from typing import Any
+
 import drjit as dr
 
 from ..base.arrays import Floats, Indices, Vectors, vector3_type
+
+
+def rows(uint: Any, count: int, size: int) -> tuple[Indices, Indices]:
+    """The row of each of ``count`` entries, in rows of ``size``, and its place there."""
+    index = dr.arange(uint, count)
+    row = index // size
+    return row, index - row * size
 
 
 def stratified(
@@ -29,11 +38,9 @@ def stratified(
         interval is as finite as the others.
     """
     float_type = type(t_near)
-    uint = dr.uint32_array_t(float_type)
     rays = max(len(t_near), len(t_far))
-    index = dr.arange(uint, rays * samples)
-    ray = index // samples
-    stratum = float_type(index - ray * samples)
+    ray, stratum = rows(dr.uint32_array_t(float_type), rays * samples, samples)
+    stratum = float_type(stratum)
     if jitter is None:
         offset = float_type(0.5)
     elif len(jitter) == rays and samples > 1:
@@ -58,12 +65,10 @@ def points_along(o: Vectors, d: Vectors, t: Floats, ray: Indices) -> Vectors:
 
 def stratum_edges(t_near: Floats, t_far: Floats, samples: int) -> Floats:
     """The ends of equal strata: R·(S + 1) ascending parameters, of S strata a ray."""
-    float_type = type(t_near)
-    uint = dr.uint32_array_t(float_type)
-    index = dr.arange(uint, len(t_near) * (samples + 1))
-    ray = index // (samples + 1)
+    float_type, ends = type(t_near), samples + 1
+    ray, within = rows(dr.uint32_array_t(float_type), len(t_near) * ends, ends)
     near, far = dr.gather(float_type, t_near, ray), dr.gather(float_type, t_far, ray)
-    share = float_type(index - ray * (samples + 1)) * (1 / samples)
+    share = float_type(within) * (1 / samples)
     return dr.select(share < 1, dr.fmin(dr.fma(share, far - near, near), far), far)
 
 
@@ -78,11 +83,8 @@ def cell_edges(t: Floats, t_near: Floats, t_far: Floats, samples: int) -> Floats
     Returns:
         R·(S + 1) ascending parameters, from ``t_near`` to ``t_far``.
     """
-    float_type = type(t)
-    uint = dr.uint32_array_t(float_type)
-    index = dr.arange(uint, len(t_near) * (samples + 1))
-    ray = index // (samples + 1)
-    within = index - ray * (samples + 1)
+    float_type, ends = type(t), samples + 1
+    ray, within = rows(dr.uint32_array_t(float_type), len(t_near) * ends, ends)
     after = ray * samples + dr.fmin(within, samples - 1)
     before = ray * samples + dr.fmax(within, 1) - 1
     middle = 0.5 * (dr.gather(float_type, t, before) + dr.gather(float_type, t, after))
@@ -93,13 +95,7 @@ def cell_edges(t: Floats, t_near: Floats, t_far: Floats, samples: int) -> Floats
 def cell_widths(t: Floats, t_near: Floats, t_far: Floats, samples: int) -> Floats:
     """The part of each ray that belongs to each sample: up to halfway to its neighbours.
 
-    Args:
-        t: R·S ascending parameters.
-        t_near, t_far: bounds of R rays.
-        samples: S.
-
-    Returns:
-        R·S widths ≥ 0 that sum to ``t_far − t_near``.
+    R·S widths ≥ 0 that sum to ``t_far − t_near``; arguments as for :func:`cell_edges`.
     """
     below, above = half_widths(t, t_near, t_far, samples)
     return below + above
@@ -108,9 +104,7 @@ def cell_widths(t: Floats, t_near: Floats, t_far: Floats, samples: int) -> Float
 def half_widths(t: Floats, t_near: Floats, t_far: Floats, samples: int) -> tuple[Floats, Floats]:
     """The parts of a sample's cell before and behind the sample; see :func:`cell_widths`."""
     float_type = type(t)
-    index = dr.arange(dr.uint32_array_t(float_type), len(t))
-    ray = index // samples
-    within = index - ray * samples
+    ray, within = rows(dr.uint32_array_t(float_type), len(t), samples)
     before, after = neighbours(t, samples)
     to_near = t - dr.gather(float_type, t_near, ray)
     to_far = dr.gather(float_type, t_far, ray) - t

@@ -46,19 +46,19 @@ def render_view(
         spp: rays a pixel, rounded down to a square number.
     """
     side = max(1, int(np.sqrt(spp)))
-    total: list[Image] = []
-    queries = 0
+    passes, queries = [], 0
     for i in range(side * side):
         offset = ((i % side + 0.5) / side, (i // side + 0.5) / side)
         o, d = _rays(intrinsics, cam_to_world, backend, offset)
         seen = render_rays(marched, o, d)
-        planes = np.stack([np.array(v) for v in (*seen.color, seen.opacity, seen.depth)])
-        total.append(planes)
+        passes.append([np.array(v) for v in (*seen.color, seen.opacity, seen.depth)])
         queries += seen.queries
-    shape = (intrinsics.height, intrinsics.width)
-    planes = np.mean([t[:4] for t in total], axis=0).reshape(4, *shape)
-    color = np.moveaxis(planes[:3], 0, -1)
-    return View(color, planes[3], _mean_depth(total).reshape(shape), queries)
+    total, shape = np.array(passes), (intrinsics.height, intrinsics.width)  # (passes, 5, H·W)
+    planes = total[:, :4].mean(axis=0).reshape(4, *shape)
+    opacity, depth = total[:, 3], total[:, 4]
+    weight = opacity.sum(axis=0)  # empty rays have no depth
+    mean = np.where(weight > 0, (opacity * depth).sum(axis=0) / np.maximum(weight, 1e-30), 0)
+    return View(np.moveaxis(planes[:3], 0, -1), planes[3], mean.reshape(shape), queries)
 
 
 def display_image(view: View, color_space: str, background: float = 1.0) -> Image:
@@ -82,11 +82,3 @@ def _rays(
     o = vector3_type(float_type)(*(o[i] + dr.zeros(float_type, len(index)) for i in range(3)))
     dr.eval(o, d)
     return o, d
-
-
-def _mean_depth(total: list[Image]) -> Image:
-    """Mean of the depths, weighted by opacity: empty rays do not count."""
-    opacity = np.stack([t[3] for t in total])
-    depth = np.stack([t[4] for t in total])
-    weight = opacity.sum(axis=0)
-    return np.where(weight > 0, (opacity * depth).sum(axis=0) / np.maximum(weight, 1e-30), 0)

@@ -18,7 +18,7 @@ Forwards, from a pixel to the film (``nerf``; what is called stands below what c
 
 Backwards, from a gradient of the image to parameters (``nerf``)::
 
-    film.FieldIntegrator._render_backward   to the film's sums; then for each pass, traced again:
+    film.FieldIntegrator.render_backward   to the film's sums; then for each pass, traced again:
       FieldIntegrator._splat                  its adjoint: to color, alpha, depth of every ray
       field_scene.FieldScene.backward
         backdrop.Backdrop.backward              to surfaces and lights, by the nested integrator

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -150,7 +148,6 @@ class Surfaces(Backdrop):
         return light
 
     def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
-        """Carries gradients of the radiance to the parameters of surfaces and lights."""
         if not self._differentiable():
             return
         pull = mi.Color3f(*gradients) * (1 / self._paths)
@@ -166,7 +163,6 @@ class Surfaces(Backdrop):
             dr.eval()
 
     def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
-        """The derivative of the radiance along the gradients of surfaces and lights."""
         total = dr.zeros(mi.Color3f, dr.width(ray))
         if not self._differentiable():
             return list(total)
@@ -231,11 +227,9 @@ def _class_name(integrator: Any) -> str:
     return name if name in _REPLAYED else str(integrator.class_name())
 
 
-@contextmanager
-def _differentiable_loops() -> Iterator[None]:
+def _differentiable_loops() -> Any:
     """Loops step by step: recorded ones of Mitsuba's C++ integrators have no adjoint."""
-    with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False):
-        yield
+    return dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, False)
 
 
 def _backward(values: list[Any], gradients: list[Any]) -> None:

@@ -21,7 +21,6 @@ from ..base.errors import InputError
 
 _AXES = (".X", ".Y", ".Z")
 
-
 Channels = dict[str, Any]  # color, alpha, and what else an integrator knows, ray by ray
 
 
@@ -40,19 +39,11 @@ class Traced(Protocol):
     """What the rays of a pass have found."""
 
     @property
-    def camera(self) -> CameraRays:
-        """The rays."""
+    def outputs(self) -> list[Any]:
+        """The arrays of which the channels are made, where derivatives can be had."""
 
     def channels(self) -> Channels:
-        """What they show."""
-
-
-class DifferentiableTraced(Traced, Protocol):
-    """The same, where derivatives can be had."""
-
-    @property
-    def outputs(self) -> list[Any]:
-        """The arrays of which the channels are made."""
+        """What the rays show."""
 
 
 class TracedScene(Protocol):
@@ -61,12 +52,8 @@ class TracedScene(Protocol):
     def trace(self, camera: CameraRays) -> Any:
         """What the rays find, a :class:`Traced`; without derivatives."""
 
-
-class DifferentiableScene(TracedScene, Protocol):
-    """A scene with derivatives with respect to its parameters."""
-
     def backward(self, traced: Any, gradients: list[Any]) -> None:
-        """Carries gradients of the ``outputs`` to the parameters."""
+        """Carries gradients of the ``outputs`` to the parameters of the scene."""
 
     def forward(self, traced: Any) -> list[Any]:
         """The derivatives of the ``outputs`` along the gradients of the parameters."""
@@ -77,6 +64,7 @@ class FieldIntegrator(ADIntegrator):
 
     plugin: str  # its name
     known: tuple[str, ...]  # extra channels that it offers
+    differentiable = False  # whether its scenes have derivatives
     rays_per_pass = 1 << 22  # traced at a time; more samples per pixel take several passes
     rays_per_adjoint = 1 << 18  # the same for derivatives, which keep more of every ray
 
@@ -108,7 +96,7 @@ class FieldIntegrator(ADIntegrator):
 
     @abstractmethod
     def _scene(self, scene: mi.Scene) -> Any:
-        """The scene as it is now: a :class:`TracedScene`."""
+        """The scene as it is now: a :class:`TracedScene`, without derivatives only ``trace``."""
 
     # ---------------------------------- Rendering ----------------------------------
 
@@ -146,9 +134,8 @@ class FieldIntegrator(ADIntegrator):
         """Radiance along single rays, for integrators that nest this one; 0 if not active."""
         with dr.suspend_grad():
             random = self._draw(sampler, dr.width(ray), 0)
-            channels = (
-                self._scene(scene).trace(CameraRays(ray, None, None, random, sampler)).channels()
-            )
+            camera = CameraRays(ray, None, None, random, sampler)
+            channels = self._scene(scene).trace(camera).channels()
             active = mi.Bool(active)
             color = dr.select(active, channels["color"], 0)
             aovs = [dr.select(active, value, 0) for value in self._aov_values(channels)]
@@ -156,14 +143,26 @@ class FieldIntegrator(ADIntegrator):
 
     # ---------------------------------- Derivatives ----------------------------------
 
-    def _render_backward(
-        self, scene: mi.Scene, grad_in: Any, sensor: int | mi.Sensor, seed: Any, spp: int
+    def render_backward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        grad_in: Any,
+        sensor: int | mi.Sensor = 0,
+        seed: Any = 0,
+        spp: int = 0,
     ) -> None:
-        """Carries the gradient of an image to the scene, pass by pass."""
+        """Carries the gradient of an image to the parameters of fields, surfaces and lights.
+
+        First to the film's sums, then pass by pass to the values of camera rays, and chunk by
+        chunk through quadrature and network: memory grows neither with the image nor with
+        the samples per pixel.
+        """
+        self._require_derivatives()
         sensor = self._sensor(scene, sensor)
         film, limit = sensor.film(), self.rays_per_adjoint
         with dr.suspend_grad():
-            view: DifferentiableScene = self._scene(scene)
+            view: TracedScene = self._scene(scene)
             sums = self._weights(scene, sensor, seed, spp)
             with dr.resume_grad():
                 dr.enable_grad(sums.tensor())
@@ -171,7 +170,7 @@ class FieldIntegrator(ADIntegrator):
                 _pull(film.develop(), grad_in)
                 adjoint = dr.grad(sums.tensor())
             for camera in self._passes(scene, sensor, seed, spp, limit):
-                traced: DifferentiableTraced = view.trace(camera)
+                traced: Traced = view.trace(camera)
                 outputs = traced.outputs
                 with dr.resume_grad():
                     dr.enable_grad(outputs)
@@ -183,16 +182,24 @@ class FieldIntegrator(ADIntegrator):
                 view.backward(traced, gradients)
                 dr.eval()
 
-    def _render_forward(self, scene: mi.Scene, sensor: int | mi.Sensor, seed: Any, spp: int) -> Any:
-        """The derivative of an image along the gradients of the scene, pass by pass."""
+    def render_forward(
+        self,
+        scene: mi.Scene,
+        params: Any,
+        sensor: int | mi.Sensor = 0,
+        seed: Any = 0,
+        spp: int = 0,
+    ) -> Any:
+        """The derivative of an image along the gradients of the scene's parameters."""
+        self._require_derivatives()
         sensor = self._sensor(scene, sensor)
         film, limit = sensor.film(), self.rays_per_adjoint
         with dr.suspend_grad():
-            view: DifferentiableScene = self._scene(scene)
+            view: TracedScene = self._scene(scene)
             sums = self._weights(scene, sensor, seed, spp)
             tangent = dr.zeros(mi.TensorXf, sums.tensor().shape)
             for camera in self._passes(scene, sensor, seed, spp, limit):
-                traced: DifferentiableTraced = view.trace(camera)
+                traced: Traced = view.trace(camera)
                 outputs, slopes = traced.outputs, view.forward(traced)
                 with dr.resume_grad():
                     dr.enable_grad(outputs)
@@ -210,6 +217,15 @@ class FieldIntegrator(ADIntegrator):
                 image = film.develop()
                 dr.forward_to(image)
                 return dr.grad(image)
+
+    def _unlike(self, name: str, value: Any, expected: str) -> InputError:
+        return InputError(f"{self.plugin}: {name}={value}, expected {expected}")
+
+    def _require_derivatives(self) -> None:
+        if not self.differentiable:
+            raise InputError(
+                f"{self.plugin}: has no derivatives, expected the integrator 'nerf' for them"
+            )
 
     def _weights(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> mi.ImageBlock:
         """The film's sums of an image that is black: only the weights of the samples."""

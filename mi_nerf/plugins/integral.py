@@ -56,11 +56,25 @@ def see(fields: list[SampledField], rays: Rays, *, normals: bool = False) -> See
 
 
 def transmittance(fields: list[SampledField], rays: Rays) -> Any:
-    """The share of light that the fields let pass along R rays, for which colours do not matter."""
+    """The share of light that the fields let pass along R rays, without derivatives.
+
+    As :class:`Integral` finds it. Only densities are asked for, and as they add up, nothing
+    has to be merged.
+    """
     through = dr.full(mi.Float, 1, len(rays.o[0]))
     dr.make_opaque(through)
     for where, part in chunks(fields, rays):
-        dr.scatter(through, dr.exp(-optical_depth(fields, part)), where)
+        total = dr.zeros(mi.Float, len(where))
+        dr.make_opaque(total)
+        for crossing in crossings(fields, part, dr.ADMode.Primal, emission=False):
+            samples, density = crossing.samples, crossing.evaluation.density
+            depth = dr.block_sum(density * samples.delta, samples.count)
+            if crossing.ray is None:
+                total += depth
+            else:
+                dr.scatter_add(total, depth, crossing.ray)
+            dr.eval(total)
+        dr.scatter(through, dr.exp(-total), where)
         dr.eval(through)
     return through
 
@@ -155,24 +169,6 @@ class Integral:
         opacity = dr.detach(opacity)
         inverse = dr.select(opacity > 0, 1 / dr.select(opacity > 0, opacity, 1), 0)
         self.normal = [n * inverse for n in sums]
-
-
-def optical_depth(fields: list[SampledField], rays: Rays) -> Any:
-    """Of all fields along R rays, without derivatives: only densities are asked for.
-
-    As opaque as :class:`Integral` finds them. Densities add up, so nothing has to be merged.
-    """
-    total = dr.zeros(mi.Float, len(rays.o[0]))
-    dr.make_opaque(total)
-    for crossing in crossings(fields, rays, dr.ADMode.Primal, emission=False):
-        samples, density = crossing.samples, crossing.evaluation.density
-        depth = dr.block_sum(density * samples.delta, samples.count)
-        if crossing.ray is None:
-            total += depth
-        else:
-            dr.scatter_add(total, depth, crossing.ray)
-        dr.eval(total)
-    return total
 
 
 def chunks(fields: list[SampledField], rays: Rays) -> Iterator[tuple[Any, Rays]]:

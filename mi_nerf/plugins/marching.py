@@ -9,7 +9,6 @@ import mitsuba as mi
 
 from ..base.errors import InputError
 from ..march.rules import Rule
-from ..march.settings import MarchSettings
 from .film import FieldIntegrator
 from .placement import PlacedField
 from .sampled import SampledField
@@ -39,9 +38,6 @@ class MarchingIntegrator(FieldIntegrator):
             raise self._unlike(name, value, f"{least} or more")
         return value
 
-    def _unlike(self, name: str, value: Any, expected: str) -> InputError:
-        return InputError(f"{self.plugin}: {name}={value}, expected {expected}")
-
     def _settings(self) -> str:
         """For ``to_string``."""
         return (
@@ -59,17 +55,19 @@ class MarchingIntegrator(FieldIntegrator):
 
     def _marched(self, found: list[PlacedField], encoded: bool = False) -> list[SampledField]:
         """The fields of the scene, and how they are sampled."""
-        return [
-            SampledField(placed, self._march(placed), self.near, self.far, encoded)
-            for placed in found
-        ]
-
-    def _march(self, placed: PlacedField) -> MarchSettings:
-        march = placed.medium.march
-        samples = self.samples or march.samples
-        stop = march.stop if self.stop is None else self.stop
-        rule = self.rule or march.rule
-        return replace(march, samples=samples, near=None, far=None, rule=rule, stop=stop)
+        fields = []
+        for placed in found:
+            own = placed.medium.march
+            march = replace(
+                own,
+                samples=self.samples or own.samples,
+                near=None,
+                far=None,
+                rule=self.rule or own.rule,
+                stop=own.stop if self.stop is None else self.stop,
+            )
+            fields.append(SampledField(placed, march, self.near, self.far, encoded))
+        return fields
 
     def _wants_normals(self, fields: list[SampledField]) -> bool:
         """Whether normals are among the channels."""

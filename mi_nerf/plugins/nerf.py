@@ -122,6 +122,7 @@ class NerfIntegrator(MarchingIntegrator):
     """
 
     plugin = "nerf"
+    differentiable = True
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
@@ -132,18 +133,17 @@ class NerfIntegrator(MarchingIntegrator):
     @staticmethod
     def _find_nested(props: mi.Properties) -> Any:
         """The integrator among the properties, or ``None``."""
-        found = [(key, props[key]) for key in props.unqueried()]
-        found = [(key, value) for key, value in found if isinstance(value, mi.Integrator)]
+        values = [props[key] for key in props.unqueried()]
+        found = [value for value in values if isinstance(value, mi.Integrator)]
         if len(found) > 1:
             raise InputError(f"nerf: {len(found)} nested integrators, expected at most one")
-        for _, nested in found:
+        for nested in found:
             if isinstance(nested, FieldIntegrator):
                 raise InputError(
                     f"nerf: '{nested.plugin}' nested in 'nerf', expected one like 'path' or 'prb'"
                 )
             check_nested(nested)
-            return nested
-        return None
+        return found[0] if found else None
 
     def traverse(self, callback: Any) -> None:
         """Exposes the nested integrator."""
@@ -159,38 +159,6 @@ class NerfIntegrator(MarchingIntegrator):
             f"  nested = {self.nested}\n"
             "]"
         )
-
-    # ---------------------------------- Derivatives ----------------------------------
-
-    def render_backward(
-        self,
-        scene: mi.Scene,
-        params: Any,
-        grad_in: Any,
-        sensor: int | mi.Sensor = 0,
-        seed: Any = 0,
-        spp: int = 0,
-    ) -> None:
-        """Carries the gradient of an image to the parameters of fields, surfaces and lights.
-
-        First to the film's sums, then pass by pass to the values of camera rays, and chunk by
-        chunk through quadrature and network: memory grows neither with the image nor with
-        the samples per pixel.
-        """
-        self._render_backward(scene, grad_in, sensor, seed, spp)
-
-    def render_forward(
-        self,
-        scene: mi.Scene,
-        params: Any,
-        sensor: int | mi.Sensor = 0,
-        seed: Any = 0,
-        spp: int = 0,
-    ) -> Any:
-        """The derivative of an image along the gradients of the scene's parameters."""
-        return self._render_forward(scene, sensor, seed, spp)
-
-    # ---------------------------------- Scene ----------------------------------
 
     def _scene(self, scene: mi.Scene) -> FieldScene:
         """The scene as it is now."""

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import mitsuba as mi
 
-from ..base.errors import InputError
 from .field_scene import FieldScene
 from .marching import MarchingIntegrator
 from .path_state import PathSettings
@@ -131,14 +128,6 @@ class NerfPathIntegrator(MarchingIntegrator):
             "]"
         )
 
-    def render_backward(self, *args: Any, **kwargs: Any) -> None:
-        """Refused: there are no derivatives."""
-        raise InputError(_NO_DERIVATIVES)
-
-    def render_forward(self, *args: Any, **kwargs: Any) -> Any:
-        """Refused: there are no derivatives."""
-        raise InputError(_NO_DERIVATIVES)
-
     def _scene(self, scene: mi.Scene) -> FieldScene:
         """The scene as it is now."""
         found = find_fields(scene, least=0)
@@ -160,6 +149,5 @@ class NerfPathIntegrator(MarchingIntegrator):
 
 
 _UNLIMITED = 2**31 - 1
-_NO_DERIVATIVES = "nerf_path: has no derivatives, expected the integrator 'nerf' for them"
 
 mi.register_integrator("nerf_path", NerfPathIntegrator)

@@ -24,7 +24,6 @@ from .sampled import SampledField
 class Tracked:
     """What camera rays see, by an estimate."""
 
-    camera: CameraRays
     color: list[Any]  # in front of the environment
     opacity: Any
 
@@ -59,7 +58,7 @@ class TrackedScene:
         hit = self.environment.intersect(ray)
         light = self.environment.shade(hit, ray, camera.sampler, seen.opacity)
         color = over_background(seen.color, seen.opacity, light.radiance)
-        return Tracked(camera, color, seen.opacity)
+        return Tracked(color, seen.opacity)
 
 
 class NerfTrackingIntegrator(FieldIntegrator):
@@ -126,9 +125,7 @@ class NerfTrackingIntegrator(FieldIntegrator):
         self.encoded = bool(props.get("encoded", False))
         self.majorant = props.get("majorant", None)
         if self.majorant is not None and not 0 < self.majorant < math.inf:
-            raise InputError(
-                f"nerf_tracking: majorant={self.majorant}, expected a finite number above 0"
-            )
+            raise self._unlike("majorant", self.majorant, "a finite number above 0")
 
     def to_string(self) -> str:
         """Lists the settings."""
@@ -140,14 +137,6 @@ class NerfTrackingIntegrator(FieldIntegrator):
             f"  aovs = {self.aov_names()}\n"
             "]"
         )
-
-    def render_backward(self, *args: Any, **kwargs: Any) -> None:
-        """Refused: there are no derivatives."""
-        raise InputError(_NO_DERIVATIVES)
-
-    def render_forward(self, *args: Any, **kwargs: Any) -> Any:
-        """Refused: there are no derivatives."""
-        raise InputError(_NO_DERIVATIVES)
 
     def _draw(self, sampler: mi.Sampler, rays: int, seed: Any) -> Any:
         """A random generator for each ray; samplers without randomness leave the seed."""
@@ -161,18 +150,7 @@ class NerfTrackingIntegrator(FieldIntegrator):
         return mi.PCG32(initstate=state, initseq=dr.arange(mi.UInt64, rays))
 
     def _scene(self, scene: mi.Scene) -> TrackedScene:
-        marched = self._marched(scene)
-        field, occupancy = marched.field, marched.placed.medium.occupancy
-        environment = Environment(scene, self.show_background, field.color_space == "srgb")
-        if self.majorant is None:
-            return TrackedScene(
-                marched, environment, Majorants.seen(field, occupancy, mi.Float), True
-            )
-        majorants = Majorants.constant(field, self.majorant, occupancy, mi.Float)
-        return TrackedScene(marched, environment, majorants, False)
-
-    def _marched(self, scene: mi.Scene) -> SampledField:
-        """The field of the scene."""
+        """The scene as it is now."""
         placed = find_fields(scene)
         if len(placed) > 1:
             raise InputError(
@@ -180,14 +158,19 @@ class NerfTrackingIntegrator(FieldIntegrator):
                 "('nerf' shows several)"
             )
         marched = SampledField(placed[0], placed[0].medium.march, self.near, self.far)
-        if marched.field.color_space == "srgb" and not self.encoded:
+        field, occupancy = marched.field, marched.placed.medium.occupancy
+        if field.color_space == "srgb" and not self.encoded:
             raise InputError(
                 "nerf_tracking: the field was trained on sRGB images, and decoding what is "
                 "composited in sRGB would be biased, expected encoded=true"
             )
-        return marched
+        environment = Environment(scene, self.show_background, field.color_space == "srgb")
+        seen = self.majorant is None
+        if seen:
+            majorants = Majorants.seen(field, occupancy, mi.Float)
+        else:
+            majorants = Majorants.constant(field, self.majorant, occupancy, mi.Float)
+        return TrackedScene(marched, environment, majorants, grow=seen)
 
-
-_NO_DERIVATIVES = "nerf_tracking: has no derivatives, expected the integrator 'nerf' for them"
 
 mi.register_integrator("nerf_tracking", NerfTrackingIntegrator)

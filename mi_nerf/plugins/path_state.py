@@ -54,9 +54,9 @@ class Paths:
     pdf: Any  # of its direction, by the surface's BSDF
     delta: Any  # whether that has no density: emitters and fields cannot be sampled so
 
-    def take(self, index: Any) -> Paths:
+    def take(self, index: Any) -> Any:
         """Some of them."""
-        kept = Paths(*(gather(getattr(self, f.name), index) for f in fields(self)))
+        kept = gather(self, index)
         dr.eval(kept)
         return kept
 

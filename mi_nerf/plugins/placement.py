@@ -53,12 +53,6 @@ class PlacedField:
         scale = dr.norm(local_d)
         return local_o, local_d / scale, scale
 
-    def _cube_matrix(self) -> list[list[Any]]:
-        """The matrix of the cube with the history of its vertices: three rows of four."""
-        points = _vertices(self.shape, self.number)
-        columns = [upload(mi.Float, column) for column in _from_corners().T]
-        return [[dr.sum(points[i] * column) for column in columns] for i in range(3)]
-
     def normal_to_world(self, gradient: list[Any]) -> list[Any]:
         """Unit vectors against N gradients in field coordinates; 0 where these vanish."""
         inverse = np.linalg.inv(self.to_world[:3, :3])
@@ -69,7 +63,11 @@ class PlacedField:
 
     def _change_of_inverse(self, inverse: list[list[Any]]) -> list[list[Any]]:
         """Zeros whose derivatives are those of the inverse M⁻¹: −M⁻¹ dM M⁻¹."""
-        matrix = _product(self._cube_matrix(), _rows(self.medium.to_world.matrix))
+        points = _vertices(self.shape, self.number)
+        columns = [upload(mi.Float, column) for column in _from_corners().T]
+        outer = [[dr.sum(points[i] * column) for column in columns] for i in range(3)]
+        inner = self.medium.to_world.matrix
+        matrix = _product(outer, [[inner[i, j] for j in range(4)] for i in range(4)])
         change = [[dr.detach(x) - x for x in row] for row in matrix]
         last = [mi.Float(x) for x in (0, 0, 0, 1)]
         return _product(_product([row[:3] for row in inverse], change), [*inverse, last])
@@ -129,9 +127,11 @@ def cubes_to_world(shape: mi.Shape) -> list[Matrix]:
     Raises:
         InputError: if the shape is no cube, or one is squashed flat.
     """
+    kind = shape.class_name()
+    no_cube = InputError(f"nerfmedium: inside a shape of type '{kind}', expected a 'cube'")
     count, rest = divmod(shape.vertex_count() if shape.is_mesh() else 0, _CORNERS)
     if rest or not count:
-        raise _no_cube(shape)
+        raise no_cube
     found = []
     for number in range(count):
         points = np.array(_vertices(shape, number), np.float64).reshape(3, -1)
@@ -141,14 +141,9 @@ def cubes_to_world(shape: mi.Shape) -> list[Matrix]:
         misfit = np.abs(to_world[:3] @ _unit_corners() - points).max()
         size = np.abs(points - points.mean(axis=1, keepdims=True)).max()
         if misfit > 1e-4 * size + _ROUNDING * np.abs(points).max():
-            raise _no_cube(shape)
+            raise no_cube
         found.append(to_world)
     return found
-
-
-def _no_cube(shape: mi.Shape) -> InputError:
-    kind = shape.class_name()
-    return InputError(f"nerfmedium: inside a shape of type '{kind}', expected a 'cube'")
 
 
 def _check_volume(matrix: Matrix, what: str) -> None:
@@ -174,10 +169,6 @@ def _vertices(shape: mi.Shape, number: int) -> Any:
     """The corners of one of a mesh's cubes as one array of points, with their history."""
     first = dr.opaque(mi.UInt32, number * _CORNERS)
     return shape.vertex_position(dr.arange(mi.UInt32, _CORNERS) + first)
-
-
-def _rows(matrix: Any) -> list[list[Any]]:
-    return [[matrix[i, j] for j in range(4)] for i in range(4)]
 
 
 def _product(a: list[list[Any]], b: list[list[Any]]) -> list[list[Any]]:

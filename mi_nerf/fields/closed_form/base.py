@@ -102,10 +102,6 @@ class ClosedFormField(Field):
         """Tensors of one or three entries, named as in the configuration."""
         return self._parameters
 
-    @abstractmethod
-    def density(self, p: Vectors) -> Floats:
-        """σ at N points of the box, in 1/scene unit."""
-
     def emission(self, d: Vectors) -> Vectors:
         """The radiance along N directions, as a 3-vector of linear RGB."""
         return self.vector("radiance", d)

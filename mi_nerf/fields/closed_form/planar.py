@@ -86,7 +86,6 @@ class SlabField(ClosedFormField):
     """:class:`SlabConfig` as a field."""
 
     def density(self, p: Vectors) -> Floats:
-        """σ at N points, in 1/scene unit."""
         return self.scalar("density", p) + dr.zeros(type(p[0]), len(p[0]))
 
 
@@ -107,7 +106,6 @@ class TwoColorField(SlabField):
     """:class:`TwoColorConfig` as a field."""
 
     def emission(self, d: Vectors) -> Vectors:
-        """The radiance along N directions, as a 3-vector of linear RGB."""
         share = 0.5 + 0.5 * dr.dot(dr.normalize(self.vector("axis", d)), d)
         opposite = self.vector("opposite", d)
         return opposite + (self.vector("radiance", d) - opposite) * share
@@ -132,7 +130,6 @@ class FogField(_PlanarField):
     """:class:`FogConfig` as a field; its density ends at density · exp(60)."""
 
     def density(self, p: Vectors) -> Floats:
-        """σ at N points, in 1/scene unit."""
         exponent = -self.distance(p) / self.scalar("height", p)
         return self.scalar("density", p) * dr.exp(dr.minimum(exponent, _MAX_EXPONENT))
 
@@ -153,7 +150,6 @@ class RampField(_PlanarField):
     """:class:`RampConfig` as a field."""
 
     def density(self, p: Vectors) -> Floats:
-        """σ at N points, in 1/scene unit."""
         line = self.scalar("density", p) + self.scalar("slope", p) * self.distance(p)
         return dr.maximum(line, 0)
 
@@ -177,7 +173,6 @@ class StepField(_PlanarField):
     """:class:`StepConfig` as a field."""
 
     def density(self, p: Vectors) -> Floats:
-        """σ at N points, in 1/scene unit."""
         before, beyond = self.scalar("before", p), self.scalar("beyond", p)
         return before + (beyond - before) * rise(self.distance(p), self.scalar("edge", p))
 
@@ -211,7 +206,6 @@ class SheetField(_PlanarField):
     """:class:`SheetConfig` as a field."""
 
     def density(self, p: Vectors) -> Floats:
-        """σ at N points, in 1/scene unit."""
         width = self.scalar("width", p)
         inside = rise(width / 2 - dr.abs(self.distance(p)), self.scalar("edge", p))
         return self.scalar("thickness", p) / width * inside

@@ -40,7 +40,6 @@ class GaussianField(ClosedFormField):
     """:class:`GaussianConfig` as a field."""
 
     def density(self, p: Vectors) -> Floats:
-        """σ at N points, in 1/scene unit."""
         offset = (p - self.vector("center", p)) / self.scalar("width", p)
         return self.scalar("peak", p) * dr.exp(-0.5 * dr.squared_norm(offset))
 
@@ -80,7 +79,6 @@ class ShellField(ClosedFormField):
     """:class:`ShellConfig` as a field."""
 
     def density(self, p: Vectors) -> Floats:
-        """σ at N points, in 1/scene unit."""
         square = dr.squared_norm(p - self.vector("center", p))
         r = dr.sqrt(dr.maximum(square, dr.smallest(type(square))))  # finite slope in the centre
         edge = self.scalar("edge", p)
