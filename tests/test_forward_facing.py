@@ -292,6 +292,7 @@ def test_evaluation_refuses_cameras_of_another_kind(
     assert f"{zoomed}: Ndc(" in said and "expected about Ndc(" in said
 
 
+@pytest.mark.slow
 def test_a_run_goes_on(forward_run: Path, tmp_path: Path) -> None:
 
     run = Path(shutil.copytree(forward_run, tmp_path / "run"))
@@ -300,6 +301,7 @@ def test_a_run_goes_on(forward_run: Path, tmp_path: Path) -> None:
     assert json.loads((run / "log.jsonl").read_text().splitlines()[-1])["step"] == 152
 
 
+@pytest.mark.slow
 def test_spiral_is_the_path_of_forward_runs(
     forward_run: Path, tmp_path: Path, refused: Callable[..., str]
 ) -> None:

@@ -66,6 +66,7 @@ def test_without_a_variant_there_is_none_to_put_back(monkeypatch: pytest.MonkeyP
     assert changes == [OURS]
 
 
+@pytest.mark.slow
 def test_functions_leave_the_variant_alone(
     callers: str, blob: Path, blob_run: Path, scene: Path, tmp_path: Path
 ) -> None:

@@ -475,6 +475,7 @@ def test_gradients_agree_with_finite_differences(kind: str, nested: str, tmp_pat
     check_gradients(kind, nested, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "nested",
     [
@@ -491,6 +492,7 @@ def test_gradients_through_every_nested_integrator(kind: str, nested: str, tmp_p
     check_gradients(kind, nested, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["surface", "weights", "all"])
 def test_gradients_pass_by_pass(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same where rays are traced in four passes, each with a seed of its own."""

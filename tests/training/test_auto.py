@@ -70,6 +70,7 @@ def chosen_for(setting: str, decisions: list[Decision]) -> Decision:
 # ---- From the data alone -----------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_follows_from_the_data(diffuse: Dataset) -> None:
     config, decisions = decided(start(steps=1), diffuse, llvm)
     found = chosen(decisions)

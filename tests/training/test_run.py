@@ -82,6 +82,7 @@ def weights_after(trainer: Trainer, steps: int, rate: float = 5e-3) -> dict[str,
 # --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_small_field_learns_the_blob(views: Dataset) -> None:
     trainer = Trainer(small(), views, ad)
     first = float(trainer.step(1e-2).mse[0])
@@ -355,6 +356,7 @@ def test_what_changes_no_step_may_be_edited(data: Path, tmp_path: Path) -> None:
     assert load_field(tmp_path / "run/field.safetensors").march.samples == 17
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("edited", ["config.json", "nothing"])
 def test_a_checkpoint_of_version_2_knows_the_seed_alone(
     data: Path, tmp_path: Path, edited: str
