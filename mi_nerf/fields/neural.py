@@ -17,10 +17,11 @@ from ..base.kernel_stages import settled, stage
 from ..cameras.ndc import Ndc
 from . import network
 from .activations import ColorActivation, DensityActivation, apply_activation
+from .blas_network import network_product, worth_blas
 from .fourier import FourierEncoding, stack_rows
 from .fused_network import FusedNetwork, HalfNetwork, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
-from .network import NetworkConfig
+from .network import NetworkConfig, rows
 from .noise import DensityNoise
 from .protocol import Field
 
@@ -124,6 +125,7 @@ class NeuralField(Field):
             if weights[name].shape != shape:
                 raise ValueError(f"tensor '{name}' is {weights[name].shape}, expected {shape}")
         self._weights = {name: upload(tensor_type, weights[name]) for name in shapes}
+        self._on_host = worth_blas(config.network, tensor_type)
         self._grid = None
         if config.grid is not None:
             self._grid = HashGrid(config.grid, type(self._weights[network.GRID].array))
@@ -166,6 +168,8 @@ class NeuralField(Field):
         return {name: np.array(tensor) for name, tensor in self._weights.items()}
 
     def density(self, p: Vectors) -> Floats:
+        if self._on_host:
+            return self._density(self._product(p)[0], p)
         raw = network.density_head(self.config.network, self._weights, self._trunk(p))
         return self._density(raw, p)
 
@@ -174,9 +178,10 @@ class NeuralField(Field):
         config = self.config
         if self._loss_scale is not None:
             return self._answer(HalfNetwork(config.network, self._weights, self._loss_scale), p, d)
-        h = self._trunk(p)
-        with stage("encoding"):
-            direction = settled(config.direction(d)) if config.network.view_dependent else None
+        if self._on_host:
+            density, *color = self._product(p, d)
+            return self._density(density, p), self._color(color)
+        h, direction = self._trunk(p), self._direction(d)
         raw = network.color_head(config.network, self._weights, h, direction)
         density = network.density_head(config.network, self._weights, h)
         return self._density(density, p), self._color(raw)
@@ -203,9 +208,27 @@ class NeuralField(Field):
         return self._density(density, p), self._color(color)
 
     def _trunk(self, p: Vectors) -> Tensor:
+        return network.trunk(self.config.network, self._weights, self._position(p))
+
+    def _product(self, p: Vectors, d: Vectors | None = None) -> list[Floats]:
+        """Raw density, and raw colours with ``d``, by matrix products of the host's."""
+        weights = {n: w for n, w in self._weights.items() if n != network.GRID}
+        features = {"position": self._position(p)}
+        if d is not None and self.config.network.view_dependent:
+            features["direction"] = self._direction(d)
+        emission = d is not None
+        raw = network_product(self.config.network, weights, features, emission=emission)
+        return rows(raw)
+
+    def _position(self, p: Vectors) -> Tensor:
         with stage("encoding"):
-            position = settled(stack_rows(self._features(p)))
-        return network.trunk(self.config.network, self._weights, position)
+            return settled(stack_rows(self._features(p)))
+
+    def _direction(self, d: Vectors) -> Tensor | None:
+        if not self.config.network.view_dependent:
+            return None
+        with stage("encoding"):
+            return settled(self.config.direction(d))
 
     def _features(self, p: Vectors) -> list[Floats]:
         config = self.config
