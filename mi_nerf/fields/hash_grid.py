@@ -23,7 +23,7 @@ class HashGridConfig:
 
     levels: int = 8  # resolutions
     features: int = 4  # a vertex of every level; four are gathered at once
-    log2_entries: int = 16  # vertices that a level has memory for, at most 2 to this power
+    log2_entries: int | None = 16  # a level stores at most 2 to this power; none: by the images
     coarsest: int = 16  # vertices along [−1, 1] at the first level
     finest: int | None = None  # vertices at the last level; none: as many as the images resolve
 
@@ -35,7 +35,7 @@ class HashGridConfig:
             ("coarsest", 2, 1 << 16),
         ):
             value = getattr(self, name)
-            if not lowest <= value <= highest:
+            if value is not None and not lowest <= value <= highest:
                 raise ValueError(f"grid: {name}={value}, expected {lowest} to {highest}")
         if self.features > 1 and self.features % 2:
             raise ValueError(f"grid: features={self.features}, expected 1 or an even number")
@@ -61,8 +61,15 @@ class HashGridConfig:
             scale = 2.0 ** (level * math.log2(self.growth())) * self.coarsest - 1
             vertices = (math.ceil(scale) + 1) ** 3
             vertices = -(-vertices // self.features) * self.features
-            total += min(vertices, 1 << self.log2_entries)
+            total += min(vertices, self.most_entries)
         return total
+
+    @property
+    def most_entries(self) -> int:
+        """Vertices that a level has memory for at most, once that is found."""
+        if self.log2_entries is None:
+            raise ValueError("grid: log2_entries is not found yet, expected a number")
+        return 1 << self.log2_entries
 
 
 class HashGrid:
@@ -76,7 +83,7 @@ class HashGrid:
             3,
             n_levels=config.levels,
             n_features_per_level=config.features,
-            hashmap_size=1 << config.log2_entries,
+            hashmap_size=config.most_entries,
             base_resolution=config.coarsest,
             per_level_scale=config.growth(),
         )

@@ -151,7 +151,8 @@ def _require_same_settings(path: str | Path, description: Description, trainer: 
         before = to_json(from_json(description.settings, str(path)))
     found, wanted = dict(leaves(now)), dict(leaves(before))
     for name in sorted(found.keys() | wanted.keys()):
-        if name not in _FREE and found.get(name) != wanted.get(name):
+        older = name == "box" and wanted.get(name) is None  # was found, and not written down
+        if name not in _FREE and found.get(name) != wanted.get(name) and not older:
             raise InputError(
                 f"{path}: does not fit this run: it was trained with {name}="
                 f"{as_text(wanted.get(name))}, expected {as_text(found.get(name))} as in the run"

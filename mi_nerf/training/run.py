@@ -60,12 +60,13 @@ class Run:
                 count while :meth:`reports` is at work.
             trainer: of this configuration and dataset, to go on with if it has begun.
         """
-        self.folder, self.config, self.variant = folder, config, variant
+        self.folder, self.variant = folder, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
         self.interrupted = False  # by Ctrl-C, when last trained
         self._started = started  # None: the clock stands still,
         self._paused = time.monotonic()  # since then
         self.trainer = trainer or Trainer(config, dataset, array_module(variant))
+        self.config = self.trainer.config  # with what follows from the data
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before the clock was last started
         self._skipped = 0
@@ -257,12 +258,9 @@ class Run:
 
     def _advance(self) -> None:
         """Launches a step, then reads the results of the one before."""
-        rate = learning_rate(
-            self.config.optimizer,
-            self.progress,
-            self.trainer.step_count - self._attempt_start,
-        )
-        result = self.trainer.step(rate)
+        progress, age = self.progress, self.trainer.step_count - self._attempt_start
+        rate = learning_rate(self.config.optimizer, progress, age)
+        result = self.trainer.step(rate, progress)
         self._settle()
         self._pending = result
         self._rate = rate
