@@ -33,6 +33,7 @@ from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .config import TrainConfig, to_json
 from .progress import Meter, ProgressBar
 from .run_folder import CHECKPOINT, CONFIG, FIELD, FORMAT, LOG, cut_log, read_config
+from .scaling import summary
 from .schedule import learning_rate
 from .trainer import StepResult, Trainer
 
@@ -93,6 +94,12 @@ class Run:
         if self.config.max_seconds:
             shares.append(self.seconds / self.config.max_seconds)
         return min(1.0, max(shares))
+
+    @property
+    def sizes(self) -> str:
+        """What is trained, in a line: features, cells, strata, and how much memory they take."""
+        trainer = self.trainer
+        return summary(self.config, trainer.field_config, trainer.image_bytes)
 
     def resume(self) -> None:
         """Goes back to the checkpoint of the folder, and cuts the log to match."""

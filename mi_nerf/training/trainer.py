@@ -31,7 +31,7 @@ from .losses import LOSSES, squared_error
 from .model import carved_cells, field_config
 from .optimizer import Adam, JointParameters
 from .scaling import resolved
-from .schedule import image_level
+from .schedule import grid_level_weights, image_level
 
 _FEWEST_RAYS = 8  # in a step
 _BYTES_PER_SAMPLE = 100  # parameter, width, density, colour, weight, and their adjoints
@@ -202,6 +202,7 @@ class Trainer:
         Args:
             progress: share of the run's budget that is spent: how sharp the images are.
         """
+        self._weigh_levels(progress)
         drawn = self._draw(image_level(self.config.pyramid, progress))
         found = self._differentiate(drawn)
         accepted = self._update(learning_rate, found.loss)
@@ -258,6 +259,16 @@ class Trainer:
         with stage("occupancy"):
             self._refresh_occupancy()
         return accepted
+
+    def _weigh_levels(self, progress: float) -> None:
+        """Levels of the grid join as the images come to resolve them."""
+        grid, pyramid = self.field_config.grid, self.config.pyramid
+        if grid is None or not pyramid.features or not pyramid.levels:
+            return
+        weights = self._backend.Float(grid_level_weights(pyramid, grid, progress))
+        self.field.level_weights = weights
+        if self.field.coarse is not None:
+            self.field.coarse.level_weights = weights
 
     # ------------------------------ Differentiation ---------------------------------
 
