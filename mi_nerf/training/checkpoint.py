@@ -77,7 +77,7 @@ def save_checkpoint(path: str | Path, trainer: Trainer, progress: Progress) -> N
     All randomness of a step follows from the seed and the step number, so no random
     state has to be kept besides them.
     """
-    arrays = {f"weights.{n}": np.array(t) for n, t in trainer.parameters.items()}
+    arrays = {f"weights.{n}": np.asarray(t) for n, t in trainer.parameters.items()}
     arrays |= {f"adam.{n}": a for n, a in trainer.optimizer.state().items()}
     if trainer.occupancy is not None:
         arrays |= {f"occupancy.{n}": a for n, a in trainer.occupancy.state().items()}
