@@ -11,10 +11,13 @@ import numpy as np
 from ..base.arrays import gather_vector3
 from ..base.kernel_stages import stage
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
-from ..data import Dataset
+from ..data import Dataset, evenly_spread_indices
+from ..images.read import average_blocks
 from ..images.stored import premultiplied
 from .config import PyramidConfig
 from .pixels import Pixels
+
+_COARSE_VIEWS = 16  # that stand for all views
 
 
 @dataclass
@@ -171,13 +174,15 @@ def _window(film: Intrinsics, crop: float) -> tuple[int, int, int, int]:
     return columns, rows, (film.width - columns) // 2, (film.height - rows) // 2
 
 
-def blank_loss(dataset: Dataset, background: str) -> float:
+def blank_loss(dataset: Dataset, background: str, level: int = 0) -> float:
     """Mean squared error of a field that has collapsed: empty space, or one even colour.
 
     Whichever is smaller; a field that has learnt anything stays below a good part of it.
+
+    Args:
+        level: the coarsest of a pyramid, whose pixels differ least.
     """
-    stride = max(1, dataset.images.size // 4_000_000)
-    pixels = premultiplied(dataset.images.reshape(-1, 4)[::stride]).astype(np.float64)
+    pixels = _some_pixels(dataset, level).astype(np.float64)
     color, alpha = pixels[:, :3], pixels[:, 3:]
     if background == "random":  # the mean over all backgrounds, uniform in [0, 1]
         empty = np.mean(np.square(color - alpha / 2)) + np.mean(np.square(alpha)) / 12
@@ -186,6 +191,16 @@ def blank_loss(dataset: Dataset, background: str) -> float:
     empty = np.mean(np.square(color - alpha * behind))
     even = np.mean(np.var(color + (1 - alpha) * behind, axis=0))
     return float(min(empty, even) if empty > 0 else even)
+
+
+def _some_pixels(dataset: Dataset, level: int) -> np.ndarray[Any, Any]:
+    """About a million pixels at most from all views, or those of some views of a coarse level."""
+    if level == 0:
+        stride = max(1, dataset.images.size // 4_000_000)
+        return premultiplied(dataset.images.reshape(-1, 4)[::stride])
+    some = evenly_spread_indices(len(dataset), _COARSE_VIEWS)
+    means = [average_blocks(dataset.image(i), 1 << level) for i in some]
+    return np.concatenate([m.reshape(-1, 4) for m in means])
 
 
 def step_rng(float_type: Any, seed: int, step: int) -> Any:

@@ -267,7 +267,8 @@ class Run:
         """Launches a step, then reads the results of the one before."""
         progress, age = self.progress, self.trainer.step_count - self._attempt_start
         rate = learning_rate(self.config.optimizer, progress, age)
-        result = self.trainer.step(rate, progress)
+        ends = self.config.steps or self.config.max_seconds  # else images are sharp at once
+        result = self.trainer.step(rate, progress if ends else 1.0)
         self._settle()
         self._pending = result
         self._rate = rate

@@ -146,7 +146,7 @@ class Trainer:
         self._noise_level = 0.0 if dataset.has_alpha else self.config.density.noise
         self.background = background
         self._source = RaySource(dataset, background, self._backend.Float, self.config.pyramid)
-        self.blank_loss = blank_loss(dataset, background)
+        self.blank_loss = blank_loss(dataset, background, self.config.pyramid.levels or 0)
 
     def reset(self) -> None:
         """Fresh weights, moments and occupancy, from the seed and the attempt."""

@@ -16,7 +16,7 @@ from mi_nerf.commands.shared import flag
 from mi_nerf.data import Dataset
 from mi_nerf.images.read import average_blocks
 from mi_nerf.training import pixels
-from mi_nerf.training.batches import RayBatch, RaySource, step_rng
+from mi_nerf.training.batches import RayBatch, RaySource, blank_loss, step_rng
 from mi_nerf.training.config import PyramidConfig
 from tests.training.test_pixels import views as random_views
 
@@ -152,3 +152,14 @@ def test_another_level_compiles_nothing(ad: Any) -> None:
             source.draw(512, step_rng(ad.Float, 3, step + 1), level=level)
         history = dr.kernel_history([dr.KernelType.JIT])
     assert history and all(entry["cache_hit"] for entry in history)
+
+
+@pytest.mark.parametrize("background", ["white", "black", "random"])
+def test_a_collapsed_field_at_a_coarse_level(background: str) -> None:
+    dataset = random_views(np.uint8, (3, 16, 16))
+    blocks = [average_blocks(dataset.image(i), 4) for i in range(3)]
+    camera = dataset.intrinsics.downscale(4)
+    coarse = replace(dataset, images=np.stack(blocks), intrinsics=camera)
+    found = blank_loss(dataset, background, level=2)
+    assert found == pytest.approx(blank_loss(coarse, background))
+    assert found < blank_loss(dataset, background)

@@ -105,3 +105,13 @@ def test_a_run_sharpens_with_its_progress(
 def test_more_levels_than_the_images_have_pixels_for(views: Dataset) -> None:
     with pytest.raises(InputError, match=r"pyramid.levels=5.*: expected 4 at most, .* 24x24"):
         Trainer(config("pyramid.levels=5"), views, ad)
+
+
+def test_a_run_without_an_end_has_sharp_images(
+    views: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = Run(tmp_path, config(*PYRAMID), views, "llvm_ad_rgb")
+    seen: list[float] = []
+    monkeypatch.setattr(run.trainer, "step", lambda rate, progress: seen.append(progress))
+    run._advance()
+    assert seen == [1.0]
