@@ -67,6 +67,7 @@ class Train:
         )
         for decision in run.decisions:
             print(f"auto: {decision}")
+        print(f"model: {run.sizes}")
         run.train()
         trainer = run.trainer
         hint = "" if run.progress >= 1 else "; stopped early, go on with --resume"

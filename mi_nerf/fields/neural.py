@@ -99,6 +99,7 @@ class NeuralField(Field):
 
     coarse: NeuralField | None
     _noise: DensityNoise | None = None  # added to raw densities, in training
+    level_weights: Any = None  # of the hash grid's levels, where they join one by one
     _loss_scale: Any = None  # one value, in training: the network runs in half precision
 
     def __init__(
@@ -164,8 +165,12 @@ class NeuralField(Field):
         return self._weights
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """A copy of all tensors as NumPy arrays."""
-        return {name: np.array(tensor) for name, tensor in self._weights.items()}
+        """A copy of all tensors as NumPy arrays, of the grid as its levels count now."""
+        found = {name: np.array(tensor) for name, tensor in self._weights.items()}
+        if self.level_weights is not None and self.config.grid is not None:
+            weights = np.repeat(np.array(self.level_weights), self.config.grid.level_entries())
+            found[network.GRID] *= weights[:, None]
+        return found
 
     def density(self, p: Vectors) -> Floats:
         if self._on_host:
@@ -237,7 +242,8 @@ class NeuralField(Field):
         )
         features = config.position.features(unit)
         if self._grid is not None:
-            features += self._grid.features(unit, self._weights[network.GRID])
+            table = self._weights[network.GRID]
+            features += self._grid.features(unit, table, self.level_weights)
         return features
 
     def _color(self, raw: list[Floats]) -> list[Floats]:

@@ -29,10 +29,11 @@ from ..base.machine import available_memory
 from ..data import Dataset
 from . import probes
 from .config import TrainConfig, to_json, with_settings
-from .model import carved_cells, field_config, resolved_octaves
+from .model import carved_cells, field_config
 from .plain import as_text, leaves
 from .presets import nerf, preset
 from .probes import Probe, Probes
+from .scaling import BYTES_PER_QUERY, fitting_batch, resolved, resolved_octaves, usual_batch
 from .trainer import Trainer
 
 # Of 400 steps on 200×200 pixels: a diffuse scene lost 0.0 and 0.14 dB, a glossy one 0.35
@@ -42,8 +43,6 @@ MARGIN = 0.05  # dB that a larger model, or another kind, has to gain at any rat
 _USUAL = (1, 64)  # depth and width of preset ``fast``; with 32 neurons a step takes as long
 _LARGER = ((2, 64), (2, 128))  # as they grow
 _FOURIER_COST = 3  # a step of Fourier features in steps of a hash grid of four times the batch
-_MEMORY_SHARE = 0.125  # of the machine's, for what one step keeps
-_BYTES_PER_QUERY = 8192  # activations, their gradients, samples: generous for a narrow network
 
 
 @dataclass(frozen=True)
@@ -84,6 +83,7 @@ def choose(
     """
     choice = _Settings(config, set(given) | _changed(config))
     _settle_data(choice, dataset)
+    choice.config = resolved(choice.config, dataset)
     field = field_config(choice.config, dataset)
     cells = carved_cells(choice.config, dataset, field)
     _settle_sampling(choice, float(cells.mean()))
@@ -168,7 +168,7 @@ def _settle_sampling(choice: _Settings, occupied: float) -> None:
     choice.take(
         "sampling.batch",
         batch,
-        f"a step keeps {batch * _BYTES_PER_QUERY / 2**30:.2g} GiB at most "
+        f"a step keeps {batch * BYTES_PER_QUERY / 2**30:.2g} GiB at most "
         f"of the machine's {memory / 2**30:.0f} GiB",
     )
 
@@ -182,13 +182,6 @@ def strata(finest: int, occupied: float) -> int:
     """
     affordable = 48 / max(occupied, 0.5)
     return 64 if finest <= 128 else int(max(64, 16 * round(min(finest / 2, affordable) / 16)))
-
-
-def fitting_batch(wanted: int, samples: int, memory: int) -> int:
-    """Queries a step that keep no more than a fair part of ``memory`` bytes; a ray's at least."""
-    while wanted > samples and wanted * _BYTES_PER_QUERY > _MEMORY_SHARE * memory:
-        wanted //= 2
-    return max(wanted, samples)
 
 
 # ---- From probes ------------------------------------------------------------------
@@ -299,8 +292,8 @@ def _settle_fourier(choice: _Settings, why: str) -> None:
     choice.take("position", None, why)
     for name in ("depth", "width", "view_depth", "view_width"):
         choice.take(f"network.{name}", getattr(network, name), why)
-    for name in ("batch", "hidden"):
-        choice.take(f"sampling.{name}", getattr(model.sampling, name), why)
+    choice.take("sampling.batch", usual_batch(features=False), why)
+    choice.take("sampling.hidden", model.sampling.hidden, why)
     choice.take("optimizer.muon", model.optimizer.muon, why)
 
 

@@ -127,9 +127,9 @@ class Adam:
         return accept
 
     def state(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Moments and step count, by name."""
-        result = {f"first.{n}": np.array(t) for n, t in self._first.items()}
-        result |= {f"second.{n}": np.array(t) for n, t in self._second.items()}
+        """Moments and step count, by name; on the CPU where they lie, without a copy."""
+        result = {f"first.{n}": np.asarray(t) for n, t in self._first.items()}
+        result |= {f"second.{n}": np.asarray(t) for n, t in self._second.items()}
         result["steps"] = np.array(self._steps)
         return result
 

@@ -33,6 +33,7 @@ from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .config import TrainConfig, to_json
 from .progress import Meter, ProgressBar
 from .run_folder import CHECKPOINT, CONFIG, FIELD, FORMAT, LOG, cut_log, read_config
+from .scaling import summary
 from .schedule import learning_rate
 from .trainer import StepResult, Trainer
 
@@ -60,12 +61,13 @@ class Run:
                 count while :meth:`reports` is at work.
             trainer: of this configuration and dataset, to go on with if it has begun.
         """
-        self.folder, self.config, self.variant = folder, config, variant
+        self.folder, self.variant = folder, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
         self.interrupted = False  # by Ctrl-C, when last trained
         self._started = started  # None: the clock stands still,
         self._paused = time.monotonic()  # since then
         self.trainer = trainer or Trainer(config, dataset, array_module(variant))
+        self.config = self.trainer.config  # with what follows from the data
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before the clock was last started
         self._skipped = 0
@@ -92,6 +94,12 @@ class Run:
         if self.config.max_seconds:
             shares.append(self.seconds / self.config.max_seconds)
         return min(1.0, max(shares))
+
+    @property
+    def sizes(self) -> str:
+        """What is trained, in a line: features, cells, strata, and how much memory they take."""
+        trainer = self.trainer
+        return summary(self.config, trainer.field_config, trainer.image_bytes)
 
     def resume(self) -> None:
         """Goes back to the checkpoint of the folder, and cuts the log to match."""
@@ -257,12 +265,10 @@ class Run:
 
     def _advance(self) -> None:
         """Launches a step, then reads the results of the one before."""
-        rate = learning_rate(
-            self.config.optimizer,
-            self.progress,
-            self.trainer.step_count - self._attempt_start,
-        )
-        result = self.trainer.step(rate)
+        progress, age = self.progress, self.trainer.step_count - self._attempt_start
+        rate = learning_rate(self.config.optimizer, progress, age)
+        ends = self.config.steps or self.config.max_seconds  # else images are sharp at once
+        result = self.trainer.step(rate, progress if ends else 1.0)
         self._settle()
         self._pending = result
         self._rate = rate

@@ -30,6 +30,8 @@ from .loss_scale import LossScale
 from .losses import LOSSES, squared_error
 from .model import carved_cells, field_config
 from .optimizer import Adam, JointParameters
+from .scaling import resolved
+from .schedule import grid_level_weights, image_level
 
 _FEWEST_RAYS = 8  # in a step
 _BYTES_PER_SAMPLE = 100  # parameter, width, density, colour, weight, and their adjoints
@@ -121,6 +123,7 @@ class Trainer:
             backend: ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
             cells: those that may hold something, (X, Y, Z) booleans; found if not given.
         """
+        config = resolved(config, dataset)
         self.config, self._backend = config, backend
         self.field_config = field_config(config, dataset)
         self._hull = carved_cells(config, dataset, self.field_config) if cells is None else cells
@@ -142,8 +145,8 @@ class Trainer:
             background = "random" if dataset.has_alpha else "white"
         self._noise_level = 0.0 if dataset.has_alpha else self.config.density.noise
         self.background = background
-        self._source = RaySource(dataset, background, self._backend.Float)
-        self.blank_loss = blank_loss(dataset, background)
+        self._source = RaySource(dataset, background, self._backend.Float, self.config.pyramid)
+        self.blank_loss = blank_loss(dataset, background, self.config.pyramid.levels or 0)
 
     def reset(self) -> None:
         """Fresh weights, moments and occupancy, from the seed and the attempt."""
@@ -176,6 +179,11 @@ class Trainer:
             sampling.rays or min(sampling.max_rays, max(1, sampling.batch // sampling.samples))
         )
 
+    @property
+    def image_bytes(self) -> int:
+        """Memory that the pixels take on the device."""
+        return self._source.nbytes
+
     def march_settings(self) -> MarchSettings:
         """How rays are sampled in training."""
         s = self.config.sampling
@@ -188,9 +196,14 @@ class Trainer:
             block=min(s.block, s.batch),
         )
 
-    def step(self, learning_rate: float) -> StepResult:
-        """One optimisation step. Launches work; reads nothing back but sample counts."""
-        drawn = self._draw()
+    def step(self, learning_rate: float, progress: float = 1.0) -> StepResult:
+        """One optimisation step. Launches work; reads nothing back but sample counts.
+
+        Args:
+            progress: share of the run's budget that is spent: how sharp the images are.
+        """
+        self._weigh_levels(progress)
+        drawn = self._draw(image_level(self.config.pyramid, progress))
         found = self._differentiate(drawn)
         accepted = self._update(learning_rate, found.loss)
         self._adapt_rays(drawn.rays, found.wanted)
@@ -209,14 +222,14 @@ class Trainer:
 
     # ---------------------------- The phases of a step ------------------------------
 
-    def _draw(self) -> _Drawn:
-        """Random rays and offsets of their samples, which follow from seed and step alone."""
+    def _draw(self, level: float = 0.0) -> _Drawn:
+        """Random rays and offsets of their samples: they follow from seed, step and level."""
         config, float_type, rays = self.config, self._backend.Float, self._ray_count()
         rng = step_rng(float_type, config.seed, self.step_count)
         crop = config.crop if self.step_count < config.crop_steps else 1.0
         fine = config.sampling.fine
         with stage("rays"):
-            batch = self._source.draw(rays, rng, crop)
+            batch = self._source.draw(rays, rng, crop, level)
             jitter = rng.random(float_type, rays * config.sampling.samples)
             fine_jitter = rng.random(float_type, rays * fine) if fine else float_type()
             dr.eval(jitter, fine_jitter)
@@ -246,6 +259,16 @@ class Trainer:
         with stage("occupancy"):
             self._refresh_occupancy()
         return accepted
+
+    def _weigh_levels(self, progress: float) -> None:
+        """Levels of the grid join as the images come to resolve them."""
+        grid, pyramid = self.field_config.grid, self.config.pyramid
+        if grid is None or not pyramid.features or not pyramid.levels:
+            return
+        weights = self._backend.Float(grid_level_weights(pyramid, grid, progress))
+        self.field.level_weights = weights
+        if self.field.coarse is not None:
+            self.field.coarse.level_weights = weights
 
     # ------------------------------ Differentiation ---------------------------------
 

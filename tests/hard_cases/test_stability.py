@@ -275,7 +275,7 @@ def test_row_17_saturation(ad: Any) -> None:
 @pytest.mark.slow
 def test_row_17_white_objects_become_opaque(ad: Any, views: Dataset) -> None:
     """Training places images with alpha before random colours unless it is told otherwise."""
-    images = views.images.copy()
+    images = views.premultiplied().copy()
     images[..., :3] = images[..., 3:]  # premultiplied white
     white = replace(views, images=images)
     opacities = {}
@@ -342,7 +342,7 @@ def test_row_19_hdr_targets(ad: Any) -> None:
 @pytest.mark.slow
 def test_row_19_linear_images_get_the_relative_loss(ad: Any, views: Dataset) -> None:
     """From 1e-3 to 1e4 in one picture."""
-    images = views.images.copy()
+    images = views.premultiplied().copy()
     images[..., :3] *= np.logspace(-3, 4, 16, dtype=np.float32)[:, None]
     trainer = Trainer(small(), replace(views, images=images, color_space="linear"), ad)
     assert trainer._loss is relative_error
