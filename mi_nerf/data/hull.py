@@ -120,8 +120,9 @@ class _Blocks:
         self, alpha: np.ndarray[Any, Any], intrinsics: Intrinsics, pose: np.ndarray[Any, Any]
     ) -> None:
         """Takes away what one view shows to be empty."""
-        sums = np.zeros((alpha.shape[0] + 1, alpha.shape[1] + 1), np.int32)
-        np.cumsum(np.cumsum(alpha > 0, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
+        seen = alpha > 0
+        sums = np.zeros((seen.shape[0] + 1, seen.shape[1] + 1), np.int32)
+        np.cumsum(np.cumsum(seen, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
         # Of a copy: what another thread changes between its two passes, NumPy does not forgive.
         blocks = np.flatnonzero(self._kept[0].copy())
         where = np.stack(np.unravel_index(blocks, self._outer), axis=-1)
@@ -142,8 +143,24 @@ class _Blocks:
                 ]
             judged, covered, area = _covered(sums, local, factor * radius, intrinsics)
             kept[blocks[judged & (covered == 0)]] = False
-            mixed = np.flatnonzero(~judged | ((covered > 0) & (covered < area)))
-            blocks, local = blocks[mixed], [along[mixed] for along in local]
+            mixed = ~judged | ((covered > 0) & (covered < area))
+            if factor == 2:  # their centre is a point of the spheres around all eight cells
+                mixed &= ~_seen_at(seen, local, intrinsics)
+            left = np.flatnonzero(mixed)
+            blocks, local = blocks[left], [along[left] for along in local]
+
+
+def _seen_at(
+    seen: np.ndarray[Any, Any], local: Sequence[np.ndarray[Any, Any]], intrinsics: Intrinsics
+) -> np.ndarray[Any, Any]:
+    """Whether points, as :func:`_covered` takes them, appear in a pixel that is true."""
+    height, width = seen.shape
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = np.floor(intrinsics.cx + intrinsics.fx * local[0] / local[2])
+        y = np.floor(intrinsics.cy + intrinsics.fy * local[1] / local[2])
+    inside = (local[2] > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    x, y = (np.where(inside, v, 0).astype(np.intp) for v in (x, y))
+    return inside & seen.ravel()[y * width + x]
 
 
 def _covered(
