@@ -31,12 +31,14 @@ from .formats.field_file import FieldFile, load_field, save_field  # noqa: E402
 from .plugins import register_always  # noqa: E402
 
 if TYPE_CHECKING:
-    from .api import describe, evaluate, generate, pictures, render, start
+    from .api import generate, pictures, render, start
     from .base.variants import available_variants, choose_variant
     from .data import Dataset, load_dataset
     from .images.metrics import psnr, ssim
     from .images.write import on_white, write_picture
     from .scene_xml.library import find_scene, scenes
+    from .tasks.describe import describe
+    from .tasks.evaluate import evaluate
     from .tasks.target import Target, open_target
     from .training.config import TrainConfig, setting_names
     from .training.run import Run, TrainingError
@@ -51,10 +53,12 @@ _LATER = {
     "images.metrics": ("psnr", "ssim"),
     "images.write": ("on_white", "write_picture"),
     "scene_xml.library": ("find_scene", "scenes"),
+    "tasks.describe": ("describe",),
+    "tasks.evaluate": ("evaluate",),
     "tasks.target": ("Target", "open_target"),
     "training.config": ("TrainConfig", "setting_names"),
     "training.run": ("Run", "TrainingError"),
-    "api": ("describe", "evaluate", "generate", "pictures", "render", "start"),
+    "api": ("generate", "pictures", "render", "start"),
 }
 
 __all__ = [

@@ -10,20 +10,14 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from . import generation
 from .base.arrays import Image
 from .base.checks import positive, valid_seed
 from .base.errors import InputError, Option
 from .base.progress_bar import progress_bar
 from .base.variants import active_variant
 from .data import Dataset
-from .scene_xml.library import find_scene
-from .tasks import render as rendering
-from .tasks.describe import describe
-from .tasks.evaluate import evaluate, reference_image
-from .tasks.target import Target
 from .training import run as training
 from .training.config import TrainConfig, with_settings
 from .training.plain import as_text
@@ -31,7 +25,11 @@ from .training.presets import preset as preset_config
 from .training.run import Run
 from .training.run_folder import CONFIG, read_config
 
-__all__ = ["describe", "evaluate", "generate", "pictures", "render", "start"]
+if TYPE_CHECKING:
+    from .tasks.target import Target
+
+# Training begins sooner without what only the other functions need: they import it themselves.
+__all__ = ["generate", "pictures", "render", "start"]
 
 Settings = Mapping[str, Any] | Sequence[str]
 
@@ -78,6 +76,9 @@ def generate(
     Raises:
         InputError: if anything is not as expected; existing files are as they were.
     """
+    from . import generation
+    from .scene_xml.library import find_scene
+
     valid_seed(seed)
     options = generation.Options(
         protocol=protocol,
@@ -189,6 +190,8 @@ def render(
     Raises:
         InputError: if the target or its dataset cannot be read.
     """
+    from .tasks import render as rendering
+
     source = target.folder if isinstance(target, Run) else target
     count, images = rendering.frames_of(
         source, active_variant(variant), path=path, frames=frames, size=size, spp=spp
@@ -203,6 +206,8 @@ def render(
 
 def pictures(dataset: Dataset) -> list[Image]:
     """The views of a dataset as :func:`evaluate` sees them: (H, W, 3) sRGB on white, 8 bits."""
+    from .tasks.evaluate import reference_image
+
     return [reference_image(dataset, k) for k in range(len(dataset))]
 
 

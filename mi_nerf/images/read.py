@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -207,6 +206,8 @@ def _decode_with(path: Path, layout: str) -> NDArray[np.uint8]:
 
 
 def _read_exr(path: Path) -> ImageFile:
+    import OpenEXR  # here: most datasets do without
+
     with _corruption_as_input_error(path):
         # No threads of its own: the caller already has one for each core.
         file = OpenEXR.File(str(path), separate_channels=True, num_threads=0)
