@@ -35,7 +35,7 @@ def test_all_parts_on_the_cpu(tmp_path: Path) -> None:
     assert parts["train_long"]["psnr"] >= parts["train_short"]["psnr"]
     assert parts["train_long"]["seconds"] > 5 and parts["train_long"]["watermark_mib"] > 1
     assert 0 < parts["render"]["least"] <= parts["render"]["median"] <= parts["render"]["greatest"]
-    for name in (*PRESETS, "fast, half precision"):
+    for name in (*PRESETS, "fast, half precision", "fast, as on a CPU"):
         row = parts["steps"][name]
         row = parts["steps"][row["as"]] if "as" in row else row
         assert row["steps_per_second"] == pytest.approx(1e3 / row["step_ms"])

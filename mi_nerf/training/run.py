@@ -31,6 +31,7 @@ from ..march.view import View, display_image, render_view
 from .auto import Choice, Decision, choose
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .config import TrainConfig, to_json
+from .device import for_device
 from .forecast import PUBLISHED_STEPS, Forecast, forecast
 from .progress import Meter, ProgressBar
 from .run_folder import CHECKPOINT, CONFIG, FIELD, FORMAT, LOG, cut_log, read_config
@@ -377,6 +378,8 @@ def start(
     elif (folder / CONFIG).exists() or (folder / CHECKPOINT).exists():
         resuming = Option("resume", True)
         raise InputError("{}: already holds a run, expected {} or another folder", folder, resuming)
+    if not recorded:
+        config = for_device(config, variant, given)
     check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
     expected = None

@@ -34,6 +34,7 @@ from mi_nerf.scene_xml.library import find_scene
 from mi_nerf.tasks.evaluate import evaluate
 from mi_nerf.training import run as training
 from mi_nerf.training.config import TrainConfig, with_settings
+from mi_nerf.training.device import for_device
 from mi_nerf.training.presets import PRESETS, preset
 from mi_nerf.training.run_folder import FIELD
 from mi_nerf.training.trainer import Trainer
@@ -205,10 +206,12 @@ def steps(found: Findings, options: argparse.Namespace) -> None:
     dataset = load_dataset(folder, "train", limit=20)
     rows: dict[str, TrainConfig] = {}
     for name in PRESETS:
-        rows[name] = _config(name, options.small)
+        config = _config(name, options.small)
+        rows[name] = for_device(config, options.variant)
         if name == "fast":
-            half = _config(name, options.small, "half_precision=true")
-            rows["fast, half precision"] = half
+            half = dataclasses.replace(config, half_precision=True)
+            rows["fast, half precision"] = for_device(half, options.variant)
+            rows["fast, as on a CPU"] = config
     kinds: dict[TrainConfig, str] = {}
     for name, config in rows.items():
         plain = dataclasses.replace(config, preset="")
