@@ -20,6 +20,7 @@ from .base.variants import active_variant
 from .data import Dataset
 from .training import run as training
 from .training.config import TrainConfig, with_settings
+from .training.forecast import PUBLISHED_STEPS
 from .training.plain import as_text
 from .training.presets import preset as preset_config
 from .training.run import Run
@@ -126,8 +127,9 @@ def start(
         out: folder of the run; created.
         preset: ``nerf``, ``fast``, ``paper``, or ``auto``, which now begins to train
             several models.
-        max_seconds, steps: the budget, wall-clock seconds of training or steps; 600 seconds if
-            neither is given.
+        max_seconds, steps: the budget, wall-clock seconds of training or steps, which the
+            learning rate follows. If neither is given: 600 seconds; with ``paper`` its
+            200,000 steps, if they take less than a day. ``run.forecast`` says what they would.
         downscale: average images over blocks of so many pixels squared.
         seed: of initial weights, rays and samples.
         settings: any other setting by its name, ``{"network.width": 128}``, or as ``--set``
@@ -137,8 +139,8 @@ def start(
             while this function and training are at work.
 
     Raises:
-        InputError: if the folder already holds a run, the data cannot be read, or a setting
-            is unknown or out of range.
+        InputError: if the folder already holds a run, the data cannot be read, a setting is
+            unknown or out of range, or ``paper`` would take days and has no budget.
     """
     assignments = _assignments(settings)
     config = replace(
@@ -148,9 +150,11 @@ def start(
     for name, value in (("steps", steps), ("max_seconds", max_seconds)):
         if value is not None:
             config = replace(config, **{name: positive(name, value)})
-    if not resume and config.steps is None and config.max_seconds is None:
-        config = replace(config, max_seconds=600.0)
-    if resume and (Path(out) / CONFIG).exists():
+    recorded = resume and (Path(out) / CONFIG).exists()
+    if not recorded and config.steps is None and config.max_seconds is None:
+        if config.preset not in PUBLISHED_STEPS:
+            config = replace(config, max_seconds=600.0)
+    if recorded:
         _require_same_settings(Path(out), config, assignments)
     return training.start(
         data,

@@ -27,6 +27,8 @@ class Train:
 
     mi-nerf train lego/ --out runs/chosen --preset auto --max-seconds 300
 
+    mi-nerf train lego/ --out runs/published --preset paper --steps 3000
+
     mi-nerf train lego/ --out runs/lego --resume
     """
 
@@ -37,7 +39,8 @@ class Train:
     preset: str = "nerf"
     """Starting point of all settings: nerf, fast, paper, or auto to choose the model itself."""
     max_seconds: float | None = None
-    """Stop after so many seconds of wall-clock time (default 600 if --steps is not given)."""
+    """Stop after so many seconds of wall-clock time (default 600 if --steps is not given; paper
+    has a schedule of its own, 200,000 steps, if they take less than a day)."""
     steps: int | None = None
     """Stop after so many steps."""
     downscale: int = 1
@@ -68,6 +71,8 @@ class Train:
         for decision in run.decisions:
             print(f"auto: {decision}")
         print(f"model: {run.sizes}")
+        if run.forecast is not None:
+            print(f"{self.preset}: {run.forecast.sentence()}", flush=True)
         run.train()
         trainer = run.trainer
         hint = "" if run.progress >= 1 else "; stopped early, go on with --resume"

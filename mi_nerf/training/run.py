@@ -31,6 +31,8 @@ from ..march.view import View, display_image, render_view
 from .auto import Choice, Decision, choose
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .config import TrainConfig, to_json
+from .device import for_device
+from .forecast import PUBLISHED_STEPS, Forecast, forecast
 from .progress import Meter, ProgressBar
 from .run_folder import CHECKPOINT, CONFIG, FIELD, FORMAT, LOG, cut_log, read_config
 from .scaling import summary
@@ -63,6 +65,7 @@ class Run:
         """
         self.folder, self.variant = folder, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
+        self.forecast: Forecast | None = None  # of a new run with a published schedule
         self.interrupted = False  # by Ctrl-C, when last trained
         self._started = started  # None: the clock stands still,
         self._paused = time.monotonic()  # since then
@@ -364,10 +367,12 @@ def start(
     ``max_seconds`` of ``config`` take its place, where given. Seconds count from ``started``,
     or else while this function and :meth:`Run.reports` are at work. A new run with preset
     ``auto`` first chooses its model, within its time but besides its steps; settings
-    named in ``given`` or unlike the preset's are kept.
+    named in ``given`` or unlike the preset's are kept. One with a preset that has a published
+    schedule first measures how long that takes, and follows it if it has no budget.
 
     Raises:
-        InputError: if the folder already holds a run, or the data cannot be read.
+        InputError: if the folder already holds a run, the data cannot be read, or a published
+            schedule that nobody asked for would take days.
     """
     folder = Path(out)
     clock = time.monotonic() if started is None else started
@@ -379,13 +384,20 @@ def start(
     elif (folder / CONFIG).exists() or (folder / CHECKPOINT).exists():
         resuming = Option("resume", True)
         raise InputError("{}: already holds a run, expected {} or another folder", folder, resuming)
+    if not recorded:
+        config = for_device(config, variant, given)
     check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
+    expected = None
+    if config.preset in PUBLISHED_STEPS and not recorded:
+        expected = forecast(config, dataset, array_module(variant))
+        if config.steps is None and config.max_seconds is None:
+            config = replace(config, steps=PUBLISHED_STEPS[config.preset])
     choice = Choice(config, [])
     if config.preset == "auto" and not recorded:
         choice = choose(config, dataset, array_module(variant), given=given)
     run = Run(folder, choice.config, dataset, variant, started=clock, trainer=choice.trainer)
-    run.decisions = choice.decisions
+    run.decisions, run.forecast = choice.decisions, expected
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
         run.resume()
