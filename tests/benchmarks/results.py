@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import ast
+import functools
 import hashlib
 import json
 import math
@@ -101,7 +102,7 @@ class Origin:
 
     def current(self) -> bool:
         """Whether the sources that the figures depend on are those measured."""
-        return self.engine is not None and self.engine == digest(self.parts)
+        return self.engine is not None and self.engine == _present(self.parts)
 
 
 @dataclass(frozen=True)
@@ -113,6 +114,12 @@ class Record:
 
 
 # ---- Engines ------------------------------------------------------------------
+
+
+@functools.cache
+def _present(parts: tuple[str, ...]) -> str:
+    """The digest of this checkout, whose sources do not change while a program runs."""
+    return digest(parts)
 
 
 def digest(parts: Iterable[str], package: Path = ROOT / "mi_nerf") -> str:

@@ -9,14 +9,15 @@ as well.
 
 The bounds are what matrix products and the features of a hash grid need at the least, each by
 itself at the rate that this machine reaches: a plain product, by Dr.Jit or NumPy, whichever is
-faster, and reads and additions at random places of a table as large as the field's. Each
-query reads eight vertices a level, and adds to as many. Sines, the optimiser, samples and Python
+faster, and plain reads of and additions to the entries of the field's table around points on
+random rays, eight a level, at places known beforehand. Sines, the optimiser, samples and Python
 have no bound here.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import tempfile
 import time
 from pathlib import Path
@@ -62,6 +63,7 @@ answer({
 })
 """
 _REPETITIONS = 9
+_ON_RAY = 10  # queries
 
 
 def main() -> None:
@@ -156,16 +158,17 @@ def bounds(
 
 
 def table_times(backend: Any, grid: HashGridConfig, queries: int) -> tuple[float, float]:
-    """Milliseconds to read the vertices of so many queries at random, and to add to them.
+    """Milliseconds to read the vertices around so many queries, and to add to them.
 
     A vertex is read as its features together, as the encoding does.
     """
-    count, features = 8 * grid.levels * queries, grid.features
-    table = dr.zeros(backend.Float, grid.entries() * features)
+    features, rng = grid.features, np.random.default_rng(0)
+    places = vertices(grid, points_on_rays(queries, rng))
+    table = backend.Float(rng.random(grid.entries() * features, np.float32))
     vertex: Any = backend.Float if features == 1 else getattr(backend, f"Array{features}f")
-    index = backend.UInt32(
-        np.random.default_rng(0).integers(0, grid.entries(), count, dtype=np.uint32)
-    )
+    index = backend.UInt32(places.ravel())
+    vertex: Any = backend.Float if features == 1 else getattr(backend, f"Array{features}f")
+    index = backend.UInt32(np.stack(places, axis=1).ravel().astype(np.uint32))  # query by query
     dr.eval(table, index)
 
     def read() -> None:
@@ -181,6 +184,31 @@ def table_times(backend: Any, grid: HashGridConfig, queries: int) -> tuple[float
     if dr.backend_v(backend.Float) == dr.JitBackend.LLVM:
         modes.append(dr.ReduceMode.Expand)  # a table for each thread
     return _milliseconds(read), min(_milliseconds(lambda mode=mode: add(mode)) for mode in modes)
+
+
+def points_on_rays(count: int, rng: np.random.Generator) -> np.ndarray[Any, Any]:
+    """(count, 3) points of [0, 1]³, ten at a time in a row as neighbours on a ray."""
+    first = rng.random((-(-count // _ON_RAY), 1, 3))
+    directions = rng.normal(size=first.shape)
+    directions /= 128 * np.linalg.norm(directions, axis=-1, keepdims=True)
+    points = first + directions * np.arange(_ON_RAY)[:, None]
+    return points.reshape(-1, 3)[:count].clip(0, 1)
+
+
+def vertices(grid: HashGridConfig, points: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """(N, levels, 8) entries of the table around the points: in order, or hashed (Teschner)."""
+    corners = np.indices((2, 2, 2)).reshape(3, 8).T
+    found, start = [], 0
+    for level in range(grid.levels):
+        side = math.ceil(grid.coarsest * grid.growth() ** level - 1) + 1
+        size = min(side**3, 1 << grid.log2_entries)
+        at = (points[:, None] * (side - 2)).astype(np.uint32) + corners.astype(np.uint32)
+        x, y, z = np.moveaxis(at, -1, 0)
+        hashed = x ^ y * np.uint32(2654435761) ^ z * np.uint32(805459861)
+        entry = x + side * (y + side * z) if side**3 <= size else hashed % size
+        found.append(start + entry)
+        start += size
+    return np.stack(found, axis=1).astype(np.uint32)
 
 
 def _milliseconds(work: Any) -> float:

@@ -97,12 +97,17 @@ def _layout(head: str) -> Layout:
     return Layout([name.strip() for name in names.split(",")], columns, only)
 
 
+def _records(file: Path) -> list[Record]:
+    """The rows of a file; none if nobody has measured them yet."""
+    return load(file) if file.exists() else []
+
+
 def _block(head: str, results: Path) -> str:
     layout = _layout(head)
     records = [
         record
         for name in layout.files
-        for record in load(results / f"{name}.json")
+        for record in _records(results / f"{name}.json")
         if all(record.row.labels.get(key) == value for key, value in layout.only)
     ]
     lines = [f"| {' | '.join(heading for heading, _ in layout.columns)} |"]
@@ -134,6 +139,8 @@ def cell(record: Record, template: str) -> str:
 
 def caption(records: Sequence[Record]) -> str:
     """When and on what the rows were measured."""
+    if not records:
+        return "<sub>Not measured yet</sub>"
     dates = sorted({record.origin.date for record in records})
     when = " to ".join(dict.fromkeys([dates[0], dates[-1]]))
     where = "; ".join(dict.fromkeys(_machine(record) for record in records))
