@@ -102,6 +102,11 @@ def test_nothing_is_written_if_not_wanted(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_parts_must_exist(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="marching: expected a file or folder of mi_nerf"):
+        figures.save("some", [ROW], options(tmp_path), "llvm_ad_rgb", ("marching",))
+
+
 @pytest.mark.parametrize("field", ["command", "date", "machine", "engine", "commit", "parts"])
 def test_incomplete_origins_are_refused(field: str, tmp_path: Path) -> None:
     saved(tmp_path, ROW)

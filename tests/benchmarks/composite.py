@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,8 @@ import mi_nerf
 from mi_nerf.base.variants import choose_variant
 from mi_nerf.fields.network import NetworkConfig, initial_weights
 from mi_nerf.fields.neural import NeuralFieldConfig
+from mi_nerf.march import query
 from mi_nerf.march.settings import MarchSettings
-from mi_nerf.plugins import crossing
 from tests.benchmarks import machine
 from tests.benchmarks.results import RENDERING, Figure, Row, add_options, save
 from tests.support.fields import camera_dict
@@ -51,8 +51,8 @@ def main() -> None:
         beside = [*_against_none(file, options.repeats), *_by_number(file, options.repeats)]
         transport = list(_light_transport(file, options.repeats))
     parts = (*RENDERING, "estimators")
-    save("composite", beside, options, variant, parts)
-    save("light_transport", transport, options, variant, parts)
+    save("composite", beside, options, variant, parts, whole=True)
+    save("light_transport", transport, options, variant, parts, whole=True)
 
 
 def _against_none(file: Path, repeats: int) -> Iterator[Row]:
@@ -90,16 +90,17 @@ def _by_number(file: Path, repeats: int) -> Iterator[Row]:
             cubes = {f"field_{i}": _cube(file, _place(name, i)) for i in range(count)}
             scene = mi.load_dict(_room({"type": "nerf"}, **cubes))
             seconds, queries = _seconds(scene, 1, repeats)
+            a_million = 1e6 * seconds / queries if queries else float("nan")
             print(
                 f"{count} {name}: {seconds:.3f} s, {queries / 1e6:.2f} million queries, "
-                f"{1e6 * seconds / queries:.3f} s a million"
+                f"{a_million:.3f} s a million"
             )
             yield Row(
                 {"what": f"{count} fields, {name}"},
                 {
                     "seconds": Figure(seconds, "s"),
                     "million_queries": Figure(queries / 1e6),
-                    "seconds_a_million": Figure(1e6 * seconds / queries, "s"),
+                    "seconds_a_million": Figure(a_million, "s"),
                 },
             )
 
@@ -160,27 +161,30 @@ def _seconds(scene: mi.Scene, spp: int, repeats: int) -> tuple[float, int]:
     """Median time of a rendering and its queries."""
     times, queries = [], 0
     for seed in range(repeats + 1):
-        counter = _CountedEvaluation
-        counter.queries = 0
+        _Counted.queries = 0
         start = time.perf_counter()
         dr.eval(mi.render(scene, spp=spp, seed=seed))
         dr.sync_thread()
         times.append(time.perf_counter() - start)
-        queries = counter.queries
+        queries = _Counted.queries
     return float(np.median(times[1:])), queries
 
 
-class _CountedEvaluation(crossing.Evaluation):
-    """Counts what the fields are asked."""
+class _Counted:
+    """Counts what the fields are asked, wherever; plugins are loaded anew with each variant."""
 
     queries = 0
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        _CountedEvaluation.queries += len(self.asked)
+
+def _count(make: Callable[..., None]) -> Callable[..., None]:
+    def counting(self: query.Evaluation, *arguments: Any, **options: Any) -> None:
+        make(self, *arguments, **options)
+        _Counted.queries += len(self.asked)
+
+    return counting
 
 
-crossing.Evaluation = _CountedEvaluation  # type: ignore
+query.Evaluation.__init__ = _count(query.Evaluation.__init__)  # type: ignore[method-assign]
 
 
 def _field_file(folder: Path) -> Path:

@@ -192,7 +192,13 @@ def save(
         whole: these are all rows of the file: older ones with other labels go.
         command: that has measured them; default: the one that was typed.
         checkout: whose engine was measured.
+
+    Raises:
+        InputError: if there is no such part, or the file cannot be read or written.
     """
+    for part in parts:
+        if not (ROOT / "mi_nerf" / part).exists():
+            raise InputError("{}: expected a file or folder of mi_nerf", part)
     if options.no_write:
         return
     file = make_folder(options.results) / f"{name}.json"
