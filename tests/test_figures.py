@@ -182,7 +182,7 @@ def test_older_engines_are_marked(tmp_path: Path) -> None:
     saved(tmp_path, ROW, replace(ROW, labels={"what": "another"}))
     page = f"Before.\n{TABLE}After.\n"
     fresh = written(page, tmp_path)
-    assert "\n| a step | 30.12 dB (29.5 – 31.0 dB) |\n" in fresh and "older" not in fresh
+    assert "\n| a step | 30.12 dB (29.50 – 31.00 dB) |\n" in fresh and "older" not in fresh
     assert written(fresh, tmp_path) == fresh
     first, second = load(tmp_path / "some.json")
     stale = replace(second, origin=replace(second.origin, engine=None))
@@ -208,7 +208,7 @@ def test_rows_can_be_left_out(tmp_path: Path) -> None:
     ("figure", "shown"),
     [
         (Figure(30.126, "dB"), "30.13 dB"),
-        (Figure(-0.1, "dB"), "−0.1 dB"),
+        (Figure(-0.1, "dB"), "−0.10 dB"),
         (Figure(0.04567, "s"), "0.0457 s"),
         (Figure(1571588), "1,571,588"),
         (Figure(float("inf")), "∞"),

@@ -176,8 +176,7 @@ def _number(value: float, unit: str, digits: str | None) -> str:
     if digits is not None:
         shown = f"{value:{digits}}"
     elif unit == "dB":
-        # Figures written down before this scheme may have one decimal.
-        shown = f"{value:.1f}" if value == round(value, 1) else f"{value:.2f}"
+        shown = f"{value:.2f}"
     elif abs(value) >= 100 or value == int(value):
         shown = f"{value:,.0f}"
     else:
