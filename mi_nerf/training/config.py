@@ -184,7 +184,8 @@ class TrainConfig:
             raise ValueError(
                 f"half_precision=true with {widest} neurons a layer, expected {WIDEST} at most"
             )
-        if self.half_precision and min(self.sampling.block, self.sampling.batch) > HALF_BLOCK:
+        together = min(self.sampling.block, self.sampling.batch or self.sampling.block)
+        if self.half_precision and together > HALF_BLOCK:
             raise ValueError(
                 f"half_precision=true with block={self.sampling.block}, expected {HALF_BLOCK} at "
                 "most: sums of more gradients lose their digits"
