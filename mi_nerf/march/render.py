@@ -24,6 +24,7 @@ from .placing import place_samples
 from .quadrature import integrate
 from .query import Evaluation
 from .settings import MarchSettings
+from .walk import walk_rays
 
 
 @dataclass
@@ -55,6 +56,11 @@ def render_rays(
     """
     float_type, settings = type(o[0]), marched.settings
     rays = max(len(o[0]), len(d[0]))
+    one_a_ray = jitter is None or len(jitter) == rays
+    walked = walk_rays(marched, o, d, jitter=jitter) if rays and one_a_ray else None
+    if walked is not None:
+        queries = int(dr.sum(walked.queries)[0])
+        return RayImage(walked.color, walked.opacity, walked.depth, queries)
     outputs = [dr.zeros(float_type, rays) for _ in range(5)]
     queries = 0
     with dr.suspend_grad():
