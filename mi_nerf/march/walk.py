@@ -35,6 +35,15 @@ class Walked:
     queries: Indices  # R numbers: how often the field was asked
 
 
+def can_walk(marched: MarchedField) -> bool:
+    """Whether a field may be asked within a kernel, and its samples are found one by one."""
+    settings, field = marched.settings, marched.field
+    refined = field.coarse is not None and settings.fine > 0
+    if settings.rule != "constant" or settings.hidden > 0 or refined:
+        return False
+    return field.fused(emission=False) is not None
+
+
 def walk_rays(
     marched: MarchedField,
     o: Vectors,
@@ -43,25 +52,21 @@ def walk_rays(
     jitter: Floats = None,
     bounds: tuple[Any, Any] = (None, None),
     emission: bool = True,
-) -> Walked | None:
-    """Marches the rays ``o + t·d``; ``None`` where the field or the settings do not allow it.
+) -> Walked:
+    """Marches the rays ``o + t·d`` of a field for which :func:`can_walk` holds.
 
     Args:
         jitter, bounds: as for :func:`mi_nerf.march.placing.place_samples`; one number a ray.
         emission: whether colour is wanted.
     """
     field, settings = marched.field, marched.settings
-    if settings.rule != "constant" or settings.hidden > 0 or (field.coarse and settings.fine):
-        return None
     with dr.suspend_grad():
         within = ray_segments(field, o, d, (settings.near, settings.far), bounds)
         dr.eval(within.o, within.d, within.view, within.near, within.far)
         ask = field.fused_along(within.view) if emission else field.fused(emission=False)
-        if ask is None:
-            return None
+        assert ask is not None
         path = _Path(within, settings.samples, jitter, marched.occupancy)
-        sums = _march(path, ask, settings.stop, emission)
-        tau, queries, *channels = sums
+        tau, queries, *channels = _march(path, ask, settings.stop, emission)
         opacity = one_minus_exp(tau)
         depth = opacity
         if emission:
@@ -118,7 +123,9 @@ class _Path:
             return stratum, ~found
 
         searching = dr.mask_t(type(self._near))(True)
-        stratum, _ = dr.while_loop((stratum, searching), going, step, labels=("stratum", "searching"))
+        stratum, _ = dr.while_loop(
+            (stratum, searching), going, step, labels=("stratum", "searching")
+        )
         return stratum
 
     def _step(self, stratum: Indices) -> tuple[Indices, Mask]:
