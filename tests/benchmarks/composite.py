@@ -27,7 +27,8 @@ from mi_nerf.base.variants import choose_variant
 from mi_nerf.fields.network import NetworkConfig, initial_weights
 from mi_nerf.fields.neural import NeuralFieldConfig
 from mi_nerf.march.settings import MarchSettings
-from mi_nerf.plugins import crossing
+from mi_nerf.march.walk import walk_rays
+from mi_nerf.plugins import crossing, sampled
 from tests.benchmarks import machine
 from tests.support.fields import camera_dict
 
@@ -149,6 +150,16 @@ class _CountedEvaluation(crossing.Evaluation):
 
 
 crossing.Evaluation = _CountedEvaluation  # type: ignore
+
+
+def _counted_walk(*arguments: Any, **options: Any) -> Any:
+    """The same of fields that are asked within one kernel."""
+    walked = walk_rays(*arguments, **options)
+    _CountedEvaluation.queries += int(dr.sum(walked.queries)[0])
+    return walked
+
+
+sampled.walk_rays = _counted_walk
 
 
 def _field_file(folder: Path) -> Path:
