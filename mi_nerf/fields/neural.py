@@ -206,6 +206,21 @@ class NeuralField(Field):
 
         return density_emission if emission else density
 
+    def fused_along(self, d: Vectors) -> Callable[..., Any] | None:
+        """See :meth:`Field.fused_along`; the first layer's share of the direction is hoisted."""
+        config = self.config
+        if not worth_fusing(config.network, type(next(iter(self._weights.values())).array)):
+            return None
+        fused, seen = FusedNetwork(config.network, self._weights), None
+        if config.network.view_dependent:
+            seen = fused.seen(config.direction.features(d))
+
+        def density_emission(p: Vectors) -> tuple[Floats, list[Floats]]:
+            density, color = fused.answer(self._features(p), seen)
+            return self._density(density, p), self._color(color)
+
+        return density_emission
+
     def _answer(self, fused: FusedNetwork, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         config = self.config
         direction = config.direction.features(d) if config.network.view_dependent else None

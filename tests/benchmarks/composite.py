@@ -27,7 +27,7 @@ import mi_nerf
 from mi_nerf.base.variants import choose_variant
 from mi_nerf.fields.network import NetworkConfig, initial_weights
 from mi_nerf.fields.neural import NeuralFieldConfig
-from mi_nerf.march import query
+from mi_nerf.march import query, walk
 from mi_nerf.march.settings import MarchSettings
 from tests.benchmarks import machine
 from tests.benchmarks.results import RENDERING, Figure, Row, add_options, save
@@ -185,6 +185,20 @@ def _count(make: Callable[..., None]) -> Callable[..., None]:
 
 
 query.Evaluation.__init__ = _count(query.Evaluation.__init__)  # type: ignore[method-assign]
+
+
+def _count_walks(make: Callable[..., Any]) -> Callable[..., Any]:
+    """The same of fields that are asked within one kernel."""
+
+    def counting(*arguments: Any, **options: Any) -> Any:
+        walked = make(*arguments, **options)
+        _Counted.queries += int(dr.sum(walked.queries)[0])
+        return walked
+
+    return counting
+
+
+walk.walk_rays = _count_walks(walk.walk_rays)  # before the plugins are imported anew
 
 
 def _field_file(folder: Path) -> Path:
