@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from ..base.arrays import Floats, Tensor, Vectors, upload, vector3_type
@@ -19,6 +20,7 @@ from . import network
 from .activations import ColorActivation, DensityActivation, apply_activation
 from .blas_network import network_product, worth_blas
 from .fourier import FourierEncoding, stack_rows
+from .frozen_features import FrozenFeatures
 from .fused_network import FusedNetwork, HalfNetwork, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
 from .network import NetworkConfig, rows
@@ -127,9 +129,10 @@ class NeuralField(Field):
                 raise ValueError(f"tensor '{name}' is {weights[name].shape}, expected {shape}")
         self._weights = {name: upload(tensor_type, weights[name]) for name in shapes}
         self._on_host = worth_blas(config.network, tensor_type)
-        self._grid = None
+        self._grid = self._frozen = None
         if config.grid is not None:
             self._grid = HashGrid(config.grid, type(self._weights[network.GRID].array))
+            self._frozen = FrozenFeatures(self._features_of)
 
     @classmethod
     def create(
@@ -173,7 +176,7 @@ class NeuralField(Field):
         return found
 
     def density(self, p: Vectors) -> Floats:
-        if self._on_host:
+        if self._on_host and not dr.flag(dr.JitFlag.FreezingScope):
             return self._density(self._product(p)[0], p)
         raw = network.density_head(self.config.network, self._weights, self._trunk(p))
         return self._density(raw, p)
@@ -183,7 +186,7 @@ class NeuralField(Field):
         config = self.config
         if self._loss_scale is not None:
             return self._answer(HalfNetwork(config.network, self._weights, self._loss_scale), p, d)
-        if self._on_host:
+        if self._on_host and not dr.flag(dr.JitFlag.FreezingScope):
             density, *color = self._product(p, d)
             return self._density(density, p), self._color(color)
         h, direction = self._trunk(p), self._direction(d)
@@ -242,7 +245,10 @@ class NeuralField(Field):
 
     def _position(self, p: Vectors) -> Tensor:
         with stage("encoding"):
-            return settled(stack_rows(self._features(p)))
+            if self._frozen is None or dr.grad_enabled(p) or dr.flag(dr.JitFlag.FreezingScope):
+                return settled(stack_rows(self._features(p)))
+            table = self._weights[network.GRID]
+            return settled(self._frozen(self._unit(p), table, self.level_weights))
 
     def _direction(self, d: Vectors) -> Tensor | None:
         if not self.config.network.view_dependent:
@@ -250,15 +256,20 @@ class NeuralField(Field):
         with stage("encoding"):
             return settled(self.config.direction(d))
 
-    def _features(self, p: Vectors) -> list[Floats]:
+    def _unit(self, p: Vectors) -> Vectors:
         config = self.config
-        unit = vector3_type(type(p[0]))(
+        return vector3_type(type(p[0]))(
             *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
         )
-        features = config.position.features(unit)
+
+    def _features(self, p: Vectors) -> list[Floats]:
+        table = None if self._grid is None else self._weights[network.GRID]
+        return self._features_of(self._unit(p), table, self.level_weights)
+
+    def _features_of(self, unit: Vectors, table: Tensor, level_weights: Floats) -> list[Floats]:
+        features = self.config.position.features(unit)
         if self._grid is not None:
-            table = self._weights[network.GRID]
-            features += self._grid.features(unit, table, self.level_weights)
+            features += self._grid.features(unit, table, level_weights)
         return features
 
     def _color(self, raw: list[Floats]) -> list[Floats]:

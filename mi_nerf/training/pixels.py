@@ -65,7 +65,9 @@ class Pixels:
 
     def mean(self, first: Indices, side: Indices) -> list[Floats]:
         """Means over blocks of ``side``×``side`` pixels, whose upper left ones are ``first``."""
-        width, count = dr.opaque(self._uint, self.width), side * side
+        width = dr.opaque(self._uint, self.width)
+        side = dr.maximum(side, 1)  # of lanes beyond the last: dividing by 0 ends the process
+        count = side * side
 
         def add(i: Any, *sums: Any) -> tuple[Any, ...]:
             row = i // side
