@@ -8,7 +8,6 @@ positions are asked for; a table that moves with every step is an argument of th
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import drjit as dr
 
