@@ -45,7 +45,7 @@ def test_half_precision_keeps_small_blocks(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(device, "has_cooperative_vectors", lambda variant: True)
     config = replace(preset("fast"), half_precision=True)
     found = for_device(config, CUDA).sampling
-    assert (found.batch, found.block) == (16 * config.sampling.batch, HALF_BLOCK)
+    assert (found.batch, found.block) == (16 * usual_batch(features=True), HALF_BLOCK)
 
 
 def test_half_precision_needs_the_driver(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,7 +172,7 @@ def test_the_command_says_what_was_chosen(
     out = tmp_path / "run"
     words = ["train", str(blob), "--out", str(out), "--preset", "paper", "--steps", "2"]
     assert main([*words, "--set", *NARROW]) == 0
-    first = capsys.readouterr().out.splitlines()[0]
+    first = next(s for s in capsys.readouterr().out.splitlines() if s.startswith("paper: "))
     assert first.startswith("paper: 2 steps take about ") and "the published 200,000" in first
     assert json.loads((out / "config.json").read_text())["settings"]["steps"] == 2
 
