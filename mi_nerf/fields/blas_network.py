@@ -300,6 +300,7 @@ class _NetworkProduct(dr.CustomOp):
         self._network = BlasNetwork(config, arrays, emission=emission)
         self._out = (4 if emission else 1, features["position"].shape[1])
         self._memory: list[Any] = []
+        dr.eval(features)  # in one kernel
         given, (out, result) = _views(features), self._new(self._out)
         with host_work(self._out[1]):
             self._network(given, result, self._keep if moving else None)

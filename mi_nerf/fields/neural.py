@@ -231,24 +231,26 @@ class NeuralField(Field):
         return self._density(density, p), self._color(color)
 
     def _trunk(self, p: Vectors) -> Tensor:
-        return network.trunk(self.config.network, self._weights, self._position(p))
+        with stage("encoding"):
+            position = settled(self._position(p))
+        return network.trunk(self.config.network, self._weights, position)
 
     def _product(self, p: Vectors, d: Vectors | None = None) -> list[Floats]:
         """Raw density, and raw colours with ``d``, by matrix products of the host's."""
         weights = {n: w for n, w in self._weights.items() if n != network.GRID}
-        features = {"position": self._position(p)}
-        if d is not None and self.config.network.view_dependent:
-            features["direction"] = self._direction(d)
         emission = d is not None
+        with stage("encoding"):
+            features = {"position": self._position(p)}
+            if emission and self.config.network.view_dependent:
+                features["direction"] = self.config.direction(d)
+            features = settled(features)  # together, as the product takes them
         raw = network_product(self.config.network, weights, features, emission=emission)
         return rows(raw)
 
     def _position(self, p: Vectors) -> Tensor:
-        with stage("encoding"):
-            if self._frozen is None or dr.grad_enabled(p) or dr.flag(dr.JitFlag.FreezingScope):
-                return settled(stack_rows(self._features(p)))
-            table = self._weights[network.GRID]
-            return settled(self._frozen(self._unit(p), table, self.level_weights))
+        if self._frozen is None or dr.grad_enabled(p) or dr.flag(dr.JitFlag.FreezingScope):
+            return stack_rows(self._features(p))
+        return self._frozen(self._unit(p), self._weights[network.GRID], self.level_weights)
 
     def _direction(self, d: Vectors) -> Tensor | None:
         if not self.config.network.view_dependent:
