@@ -107,26 +107,26 @@ def test_parts_must_exist(tmp_path: Path) -> None:
         figures.save("some", [ROW], options(tmp_path), "llvm_ad_rgb", ("marching",))
 
 
+def incomplete(folder: Path, part: str, field: str) -> Path:
+    """A file whose first origin or row lacks something."""
+    saved(folder, ROW)
+    file = folder / "some.json"
+    content = json.loads(file.read_text())
+    del content[part][0][field]
+    file.write_text(json.dumps(content))
+    return file
+
+
 @pytest.mark.parametrize("field", ["command", "date", "machine", "engine", "commit", "parts"])
 def test_incomplete_origins_are_refused(field: str, tmp_path: Path) -> None:
-    saved(tmp_path, ROW)
-    file = tmp_path / "some.json"
-    content = json.loads(file.read_text())
-    del content["origins"][0][field]
-    file.write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"some\.json: expected a complete file of figures"):
-        load(file)
+        load(incomplete(tmp_path, "origins", field))
 
 
 @pytest.mark.parametrize("field", ["labels", "figures", "protocol", "seeds", "origin"])
 def test_incomplete_rows_are_refused(field: str, tmp_path: Path) -> None:
-    saved(tmp_path, ROW)
-    file = tmp_path / "some.json"
-    content = json.loads(file.read_text())
-    del content["rows"][0][field]
-    file.write_text(json.dumps(content))
     with pytest.raises(InputError, match=r"some\.json"):
-        load(file)
+        load(incomplete(tmp_path, "rows", field))
 
 
 # ---- Engines -----------------------------------------------------------------------------

@@ -111,7 +111,6 @@ class BlasNetwork:
         second = next((layer.second_weight for layer in seen if layer.sees == "direction"), None)
         direction = weights[second].shape[1] if second else 0
         self._products = _products(config, position, direction, emission)
-        self._emits = emission
         self._matrices = [self._joined(product, weights) for product in self._products]
         self._kept: list[_Matrix] = []  # A of every product
 
@@ -188,7 +187,7 @@ class BlasNetwork:
         for k, product in enumerate(self._products if gradients else []):
             matrix = np.sum([sums[k] for sums in parts], axis=0)
             for name, rows, columns in product.blocks():
-                gradients[name][...] = matrix[rows, _own(product, columns, gradients[name])]
+                gradients[name][...] = matrix[rows, _own(columns, gradients[name])]
 
     def _backward_columns(
         self,
@@ -267,7 +266,7 @@ class BlasNetwork:
         some = weights[product.layers[0].weight]
         matrix = np.zeros((product.outputs, product.inputs), some.dtype)
         for name, rows, columns in product.blocks():
-            matrix[rows, _own(product, columns, weights[name])] = weights[name]
+            matrix[rows, _own(columns, weights[name])] = weights[name]
         return matrix
 
 
@@ -276,7 +275,7 @@ def _parts(count: int) -> list[slice]:
     return [slice(i, min(i + _COLUMNS, count)) for i in range(0, count, _COLUMNS)]
 
 
-def _own(product: _Product, columns: Any, values: _Matrix) -> Any:
+def _own(columns: Any, values: _Matrix) -> Any:
     """Where a parameter lies in M. A product may read one row, a density, more than its layers."""
     return slice(0, values.shape[1]) if columns is None else columns
 

@@ -176,7 +176,7 @@ class NeuralField(Field):
         return found
 
     def density(self, p: Vectors) -> Floats:
-        if self._on_host and not dr.flag(dr.JitFlag.FreezingScope):
+        if self._on_host and not _recorded():
             return self._density(self._product(p)[0], p)
         raw = network.density_head(self.config.network, self._weights, self._trunk(p))
         return self._density(raw, p)
@@ -186,7 +186,7 @@ class NeuralField(Field):
         config = self.config
         if self._loss_scale is not None:
             return self._answer(HalfNetwork(config.network, self._weights, self._loss_scale), p, d)
-        if self._on_host and not dr.flag(dr.JitFlag.FreezingScope):
+        if self._on_host and not _recorded():
             density, *color = self._product(p, d)
             return self._density(density, p), self._color(color)
         h, direction = self._trunk(p), self._direction(d)
@@ -248,7 +248,7 @@ class NeuralField(Field):
         return rows(raw)
 
     def _position(self, p: Vectors) -> Tensor:
-        if self._frozen is None or dr.grad_enabled(p) or dr.flag(dr.JitFlag.FreezingScope):
+        if self._frozen is None or dr.grad_enabled(p) or _recorded():
             return stack_rows(self._features(p))
         return self._frozen(self._unit(p), self._weights[network.GRID], self.level_weights)
 
@@ -283,3 +283,8 @@ class NeuralField(Field):
         if self._noise is not None:
             raw = raw + self._noise.at(p)
         return apply_activation(config.density_activation, raw) * config.density_scale
+
+
+def _recorded() -> bool:
+    """Whether ``dr.freeze`` of a caller records: it sees no work of the host."""
+    return bool(dr.flag(dr.JitFlag.FreezingScope))

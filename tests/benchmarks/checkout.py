@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from mi_nerf.base.variants import choose_variant
+from tests.benchmarks import data_folder, results
 from tests.benchmarks.results import ROOT
 
 _ANSWER = "answer: "
@@ -20,6 +22,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Options of a benchmark that compares."""
     parser.add_argument("--against", type=Path, help="folder of another checkout")
     parser.add_argument("--against-name", default="0.1.0", help="what the tables call it")
+
+
+def parsed(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The options of a comparison on a dataset, ``folder`` and ``variant`` among them."""
+    parser.add_argument("--variant")
+    add_options(parser)
+    results.add_options(parser)
+    options = parser.parse_args()
+    options.folder = data_folder(options.data).resolve()
+    options.variant = choose_variant(options.variant)
+    return options
 
 
 def versions(options: argparse.Namespace) -> dict[str, Path]:

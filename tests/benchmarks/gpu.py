@@ -33,8 +33,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.benchmarks import gpu_tests
+from tests.benchmarks.results import ROOT, commit
 
-ROOT = Path(__file__).parents[2]
 RESULT = ROOT / "docs" / "results" / "gpu.json"
 
 _BUDGET = 345.0  # seconds of all parts together
@@ -191,15 +191,6 @@ def _require_device(record: Record, options: argparse.Namespace) -> None:
             f"{options.variant} does not work on this machine ({reason}), expected an NVIDIA GPU "
             "with driver R535 or newer, or --variant llvm_ad_rgb --small"
         )
-
-
-def commit() -> str | None:
-    """The checkout's, where it has a history."""
-    try:
-        command = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return None
 
 
 def write_result(path: Path, record: Record) -> None:

@@ -34,7 +34,8 @@ from mi_nerf.training.forecast import PUBLISHED_STEPS, duration, step_seconds
 from mi_nerf.training.presets import preset
 from mi_nerf.training.run_folder import LOG
 from tests.benchmarks import data_folder
-from tests.benchmarks.gpu import commit, write_result
+from tests.benchmarks.gpu import write_result
+from tests.benchmarks.results import commit
 
 REDUCED = ["network.width=64", "network.view_width=32", "sampling.rays=256"]
 REDUCED += ["sampling.samples=32", "sampling.fine=64", "sampling.render_samples=32"]

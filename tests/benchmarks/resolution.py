@@ -22,14 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from mi_nerf.base.variants import choose_variant
-from tests.benchmarks import checkout, data_folder, machine
+from tests.benchmarks import checkout, machine
 from tests.benchmarks.results import (
     TRAINING,
     Figure,
     Protocol,
     Row,
-    add_options,
     mean_of,
     save,
 )
@@ -104,12 +102,7 @@ def main() -> None:
     parser.add_argument("--shares", type=float, nargs="*", default=[], help="of the seconds")
     parser.add_argument("--looks", type=int, default=0)
     parser.add_argument("--set", nargs="*", default=[], help="settings of this checkout")
-    parser.add_argument("--variant")
-    checkout.add_options(parser)
-    add_options(parser)
-    options = parser.parse_args()
-    options.folder = data_folder(options.data).resolve()
-    options.variant = choose_variant(options.variant)
+    options = checkout.parsed(parser)
     print(f"{machine()}, {options.data}, downscale {options.downscale}, {options.seconds:g} s")
     for preset in options.presets:
         _compare(preset, options)

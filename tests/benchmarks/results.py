@@ -206,7 +206,7 @@ def save(
         command or typed(),
         _today(),
         _machine(variant),
-        _commit(checkout),
+        commit(checkout),
         parts,
         digest(parts, checkout / "mi_nerf"),
     )
@@ -320,7 +320,7 @@ def _machine(variant: str) -> dict[str, Any]:
     return {**machine(variant), "memory_gib": memory, "system": system}
 
 
-def _commit(root: Path) -> str | None:
+def commit(root: Path = ROOT) -> str | None:
     """The commit of the checkout, with a plus where files differ from it."""
     try:
         command = ["git", "-C", str(root), "describe", "--always", "--dirty=+", "--abbrev=10"]

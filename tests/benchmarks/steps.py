@@ -26,14 +26,14 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from mi_nerf.base.variants import array_module, choose_variant
+from mi_nerf.base.variants import array_module
 from mi_nerf.data import load_dataset
 from mi_nerf.fields.hash_grid import HashGridConfig
 from mi_nerf.report.arithmetic import drjit_product_rate, numpy_product_rate, training_flop
 from mi_nerf.training.model import field_config
 from mi_nerf.training.presets import preset as preset_config
-from tests.benchmarks import checkout, data_folder, machine
-from tests.benchmarks.results import TRAINING, Figure, Row, add_options, median_of, save
+from tests.benchmarks import checkout, machine
+from tests.benchmarks.results import TRAINING, Figure, Row, median_of, save
 
 STEPS = """
 import time
@@ -78,12 +78,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=8, help="of each process")
     parser.add_argument("--repeats", type=int, default=3, help="processes of each checkout")
     parser.add_argument("--set", nargs="*", default=[], help="settings of both checkouts")
-    parser.add_argument("--variant")
-    checkout.add_options(parser)
-    add_options(parser)
-    options = parser.parse_args()
-    options.folder = data_folder(options.data).resolve()
-    options.variant = choose_variant(options.variant)
+    options = checkout.parsed(parser)
     print(f"{machine()}, {options.data}, downscale {options.downscale}")
     for preset in options.presets:
         _compare(preset, options)
