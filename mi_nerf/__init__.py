@@ -24,7 +24,7 @@ from ._version import __version__ as __version__
 ensure_llvm()  # before Dr.Jit looks for its compiler
 
 from .base.errors import InputError  # noqa: E402
-from .base.work_items import LANES, set_work_item  # noqa: E402
+from .base.workers import LANES, set_work_item  # noqa: E402
 from .fields.neural import NeuralField, NeuralFieldConfig  # noqa: E402
 from .fields.protocol import Field  # noqa: E402
 from .formats.field_file import FieldFile, load_field, save_field  # noqa: E402

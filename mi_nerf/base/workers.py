@@ -1,4 +1,4 @@
-"""Runs Python functions in Dr.Jit's own threads, for work that NumPy does.
+"""Dr.Jit's own threads on a CPU: how kernels are divided among them, and work of Python's there.
 
 A thread of Dr.Jit that has nothing to do looks for work all the time, for some 20 ms, and takes
 a core from any other thread. So work between two kernels is best given to these very threads,
@@ -13,17 +13,41 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
 import drjit as dr
-from threadpoolctl import ThreadpoolController
 
 S = TypeVar("S")
 T = TypeVar("T")
 
-_TASK = ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_void_p)
+# Lanes that one thread takes at a time. Dr.Jit's own choice is 16384, so that a kernel over the
+# 16384 queries of a training step would run on one thread. 128 to 1024 measured alike.
+LANES = 1024
+
+_POINTER, _NUMBER = ctypes.c_void_p, ctypes.c_uint32
+_TASK = ctypes.CFUNCTYPE(None, _NUMBER, _POINTER)
+_SUBMIT = (
+    *(_POINTER, _POINTER, _NUMBER, _NUMBER, _TASK, _POINTER, _NUMBER, _POINTER),
+    *(ctypes.c_int, ctypes.c_int),
+)
+
+
+def work_item() -> int | None:
+    """Lanes of a kernel that one thread takes at a time; ``None`` where that is not known."""
+    function = _function("drjit-core", "_Z19jit_llvm_block_sizev", _NUMBER)
+    return None if function is None else int(function())
+
+
+def set_work_item(lanes: int) -> bool:
+    """Sets :func:`work_item`; returns whether this Dr.Jit offers to. Kernels stay the same."""
+    function = _function("drjit-core", "_Z23jit_llvm_set_block_sizej", None, _NUMBER)
+    if function is None:
+        return False
+    function(lanes)
+    return True
 
 
 def parallel(work: Callable[[S], T], parts: Iterable[S]) -> list[T]:
@@ -32,9 +56,11 @@ def parallel(work: Callable[[S], T], parts: Iterable[S]) -> list[T]:
     Raises:
         Exception: the first that ``work`` raised.
     """
-    todo, library = list(parts), _library()
-    with _products().limit(limits=1, user_api="blas"):
-        if len(todo) < 2 or library is None:
+    todo = list(parts)
+    submit = _function("nanothread", "task_submit_dep", _POINTER, *_SUBMIT)
+    wait = _function("nanothread", "task_wait_and_release", None, _POINTER)
+    with _one_thread():
+        if len(todo) < 2 or submit is None or wait is None:
             return [work(part) for part in todo]
         results: list[Any] = [None] * len(todo)
         errors: list[BaseException] = []
@@ -46,33 +72,37 @@ def parallel(work: Callable[[S], T], parts: Iterable[S]) -> list[T]:
                 errors.append(error)
 
         function = _TASK(run)  # alive until all is done
-        task = library.task_submit_dep(None, None, 0, len(todo), function, None, 0, None, 0, 0)
+        task = submit(None, None, 0, len(todo), function, None, 0, None, 0, 0)
         if task:  # else the calling thread has done it
-            library.task_wait_and_release(task)
+            wait(task)
         if errors:
             raise errors[0]
         return results
 
 
 @cache
-def _library() -> Any:
-    """Dr.Jit's thread pool (nanothread), or none."""
-    for path in sorted(Path(dr.__file__).parent.glob("*nanothread*")):
+def _function(library: str, symbol: str, result: Any, *arguments: Any) -> Any:
+    """A C function of a library that Dr.Jit has loaded and Python does not see, or none."""
+    for path in sorted(Path(dr.__file__).parent.glob(f"*{library}*")):
         try:
-            library = ctypes.CDLL(str(path))  # the one that Dr.Jit has loaded
-            submit, wait = library.task_submit_dep, library.task_wait_and_release
-        except (OSError, AttributeError):
+            function = getattr(ctypes.CDLL(str(path)), symbol)
+        except (AttributeError, OSError):  # another platform or version
             continue
-        pointer, number = ctypes.c_void_p, ctypes.c_uint32
-        submit.restype, wait.restype, wait.argtypes = pointer, None, [pointer]
-        submit.argtypes = [
-            *(pointer, pointer, number, number, _TASK, pointer, number, pointer),
-            *(ctypes.c_int, ctypes.c_int),
-        ]
-        return library
+        function.restype, function.argtypes = result, arguments
+        return function
     return None
 
 
+def _one_thread() -> AbstractContextManager[Any]:
+    """In which matrix products run in one thread each."""
+    pools = _pools()
+    return nullcontext() if pools is None else pools.limit(limits=1, user_api="blas")
+
+
 @cache
-def _products() -> ThreadpoolController:
+def _pools() -> Any:
+    try:  # here, because only a CPU needs it: a GPU may be lent without
+        from threadpoolctl import ThreadpoolController
+    except ImportError:
+        return None
     return ThreadpoolController()
