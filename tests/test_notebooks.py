@@ -10,10 +10,11 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import nbformat
 import pytest
 
 import mi_nerf
+
+nbformat = pytest.importorskip("nbformat", reason="a GPU machine may lack it")
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
