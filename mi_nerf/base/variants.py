@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -62,14 +63,25 @@ def has_cooperative_vectors(variant: str) -> bool:
     """
     if not variant.startswith("cuda") or variant not in available_variants():
         return False
+    return multiplies_in_half(array_module(variant).Float16)
+
+
+@cache
+def multiplies_in_half(half: Any) -> bool:
+    """Whether products of cooperative vectors of this array type work; tried out once.
+
+    A driver may be new enough and OptiX missing, so that only a product itself tells.
+    """
     from drjit import nn
 
-    half = array_module(variant).Float16
+    tensor = dr.tensor_t(half)
     try:
-        nn.CoopVec(half(0), half(0))
+        with dr.suspend_grad():
+            views = nn.pack({"two": tensor(half([2.0] * 256), (16, 16))}, layout="inference")
+            first = next(iter(nn.matvec(views["two"], nn.CoopVec(*[half([1.0, 0.5])] * 16))))
+            return bool(dr.all(first == half([32.0, 16.0])))
     except RuntimeError:
         return False
-    return True
 
 
 @contextmanager

@@ -21,7 +21,7 @@ from .activations import ColorActivation, DensityActivation, apply_activation
 from .blas_network import network_product, worth_blas
 from .fourier import FourierEncoding, stack_rows
 from .frozen_features import FrozenFeatures
-from .fused_network import FusedNetwork, HalfNetwork, worth_fusing
+from .fused_network import FusedNetwork, HalfNetwork, fused_network
 from .hash_grid import HashGrid, HashGridConfig
 from .network import NetworkConfig, rows
 from .noise import DensityNoise
@@ -196,10 +196,9 @@ class NeuralField(Field):
 
     def fused(self, emission: bool = True) -> Callable[..., Any] | None:
         """See :meth:`Field.fused`; ``None`` where that would be slower."""
-        config = self.config
-        if not worth_fusing(config.network, type(next(iter(self._weights.values())).array)):
+        fused = fused_network(self.config.network, self._weights)
+        if fused is None:
             return None
-        fused = FusedNetwork(config.network, self._weights)
 
         def density_emission(p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
             return self._answer(fused, p, d)
@@ -212,9 +211,9 @@ class NeuralField(Field):
     def fused_along(self, d: Vectors) -> Callable[..., Any] | None:
         """See :meth:`Field.fused_along`; the first layer's share of the direction is hoisted."""
         config = self.config
-        if not worth_fusing(config.network, type(next(iter(self._weights.values())).array)):
+        fused, seen = fused_network(config.network, self._weights), None
+        if fused is None:
             return None
-        fused, seen = FusedNetwork(config.network, self._weights), None
         if config.network.view_dependent:
             seen = fused.seen(config.direction.features(d))
 
