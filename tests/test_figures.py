@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from mi_nerf.base.errors import InputError
+from mi_nerf.base.variants import available_variants
 from mi_nerf.fields.hash_grid import HashGridConfig
 from tests.benchmarks import all as everything
 from tests.benchmarks import note, resolution, steps
@@ -240,7 +242,8 @@ def test_commands_are_due_until_they_have_measured(tmp_path: Path) -> None:
     def commands() -> list[str]:
         return [" ".join(words) for _, words in everything.due(None, tmp_path)]
 
-    assert len(commands()) == len(everything.PLAN)
+    here = [task for task in everything.PLAN if task.needs in ("", *available_variants())]
+    assert len(commands()) == len(here)
     command = "python -m tests.benchmarks.gradient"
     saved(tmp_path, ROW, command=command)
     assert "tests.benchmarks.gradient" not in commands()
@@ -249,6 +252,35 @@ def test_commands_are_due_until_they_have_measured(tmp_path: Path) -> None:
         tmp_path / "some.json", [replace(record, origin=replace(record.origin, engine="0"))]
     )
     assert "tests.benchmarks.gradient" in commands()
+    assert not everything.by_hand(tmp_path)
+    by_hand = replace(record.origin, engine=None, command="mi-nerf demo")
+    figures.write(tmp_path / "some.json", [replace(record, origin=by_hand)])
+    assert everything.by_hand(tmp_path) == ["mi-nerf demo"]
+
+
+SAVING = [
+    file.stem
+    for file in sorted(Path(figures.__file__).parent.glob("*.py"))
+    if re.search(r"^    +save\(", file.read_text(), re.MULTILINE) and file.stem != "note"
+]
+
+
+def test_every_benchmark_is_in_the_plan() -> None:
+    planned = {shlex.split(task.command)[0] for task in everything.PLAN}
+    assert planned == {f"tests.benchmarks.{name}" for name in SAVING} | {"tests.hard_cases"}
+
+
+@pytest.mark.parametrize("task", everything.PLAN, ids=lambda task: task.command)
+def test_options_of_the_plan_exist(task: everything.Task) -> None:
+    """Its help names every option, without which a command would end hours later."""
+    module, *words = shlex.split(task.command)
+    source = Path(figures.ROOT, *module.split(".")).with_suffix(".py")
+    source = source if source.exists() else source.with_suffix("") / "__main__.py"
+    text = source.read_text()
+    wanted = [word for word in words if word.startswith("--")]
+    if task.compares:
+        assert "checkout." in text
+    assert all(f'add_argument("{word}"' in text for word in wanted)
 
 
 def test_vertices_around_points() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -97,4 +98,15 @@ def _gpu() -> str:
         for line in file.read_text().splitlines():
             if line.startswith("Model:"):
                 names.append(line.partition(":")[2].strip())
-    return ", ".join(names) or "NVIDIA GPU"
+    return ", ".join(names) or gpu_query("name") or "NVIDIA GPU"
+
+
+def gpu_query(what: str) -> str | None:
+    """What ``nvidia-smi`` says of the first device; nothing where it does not work."""
+    command = ["nvidia-smi", f"--query-gpu={what}", "--format=csv,noheader,nounits"]
+    try:
+        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    lines = found.stdout.splitlines()
+    return lines[0].strip() if lines else None

@@ -1,16 +1,18 @@
 """What the program does on a GPU, in under six minutes and without preparation.
 
     python -m tests.benchmarks.gpu --seconds 60
-    python -m tests.benchmarks.gpu --variant llvm_ad_rgb --seconds 5 --small --out FILE
+    python -m tests.benchmarks.gpu --variant llvm_ad_rgb --seconds 5 --small --results FOLDER
 
 Part after part, each in a process of its own with a time limit: the device and what it is capable
 of, the tests marked ``cuda``, the preset ``fast`` on full-size Lego for a quarter of the seconds
 and for all of them, ``mi.render`` of that field at 800x800, training steps of all presets and of
-half precision. Everything goes into one JSON file after every part, ``docs/results/gpu.json``; of
-a part that fails or runs out of time, there is its error in one line and what it had found.
+half precision. After every part, everything goes into ``docs/results/gpu.json``, with the name of
+the card; of a part that fails or runs out of time, there is its error in one line and what it had
+found.
 
 Images are those of ``lego_800`` in the folder that MI_NERF_DATA names; without it, a scene is
-path-traced first, which takes OptiX. ``--small`` has tiny ones, to try all of this on a CPU.
+path-traced first, or a ball is drawn where OptiX is missing. ``--small`` has tiny images, to try
+all of this on a CPU.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ import argparse
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -26,22 +29,54 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks import gpu_tests
-from tests.benchmarks.results import ROOT, commit
+from mi_nerf.base.machine import gpu_query
+from tests.benchmarks import gpu_tests, trained
+from tests.benchmarks.results import (
+    RENDERING,
+    ROOT,
+    TRAINING,
+    Figure,
+    Protocol,
+    Row,
+    add_options,
+    save,
+)
 
-RESULT = ROOT / "docs" / "results" / "gpu.json"
+PARTS = tuple(sorted({*TRAINING, *RENDERING}))  # of mi_nerf that the figures depend on
 
 _BUDGET = 345.0  # seconds of all parts together
 _LEAST = 5.0  # seconds left, below which no part begins
 _POLL = 0.5  # seconds between looks at the memory of the device
 
 Record = dict[str, Any]
+
+# Names and units of what the parts find; of a trained field, see trained.UNITS.
+_FIGURES = {
+    "took": ("took", "s"),
+    "product_gflops": ("product", "GFLOP/s"),
+    "passed": ("passed", ""),
+    "failed": ("failed", ""),
+    "skipped": ("skipped", ""),
+    "begun": ("begun", "s"),
+    "first_step": ("first_step", "s"),
+    "first": ("first_frame", "s"),
+    "median": ("frame", "s"),
+    "step_ms": ("step", "ms"),
+    "steps_per_second": ("steps_a_second", ""),
+    "samples_per_second": ("samples_a_second", ""),
+    "gflops": ("rate", "GFLOP/s"),
+    "watermark_mib": ("allocated", "MiB"),
+    "device_mib": ("device_memory", "MiB"),
+    "resident_mb": ("resident_memory", "MB"),
+    **{name: (name, unit) for name, unit in trained.UNITS.items()},
+}
+_SPREADS = {"median": ("least", "greatest"), "step_ms": ("fastest_ms", "slowest_ms")}
+_NOTES = ("driver", "surfaces", "half_precision", "images", "as", "error", "failures")
 
 
 @dataclass(frozen=True)
@@ -77,37 +112,30 @@ def main() -> None:
     parser.add_argument("--small", action="store_true", help="tiny images and models")
     parser.add_argument("--views", type=int, default=25, help="measured after a training")
     parser.add_argument("--budget", type=float, default=_BUDGET, help="seconds of all parts")
-    parser.add_argument("--out", type=Path, default=RESULT)
     parser.add_argument("--only", nargs="*", help="of the parts; device always runs")
+    add_options(parser)
     options = parser.parse_args()
     start = time.monotonic()
-    record = {
-        "command": " ".join(["python -m tests.benchmarks.gpu", *sys.argv[1:]]),
-        "commit": commit(),
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "machine": None,
-        "parts": {},
-    }
+    found: Record = {}
     with tempfile.TemporaryDirectory() as folder:
         for part in parts(options):
             if options.only is not None and part.name not in ("device", *options.only):
                 continue
             left = start + options.budget - time.monotonic()
             if left < _LEAST:
-                record["parts"][part.name] = {"error": "no time was left"}
+                found[part.name] = {"error": "no time was left", "took": 0.0}
             else:
-                found = run_part(part, min(part.limit, left), options, Path(folder))
-                record["parts"][part.name] = found
+                found[part.name] = run_part(part, min(part.limit, left), options, Path(folder))
             if part.name == "device":
-                _require_device(record, options)
-            record["seconds"] = round(time.monotonic() - start, 1)
-            write_result(options.out, record)
-            print(f"{part.name}: {_line(record['parts'][part.name])}", flush=True)
-    print(f"{record['seconds']} s, {options.out}")
+                _require_device(found["device"], options)
+            print(f"{part.name}: {_line(found[part.name])}", flush=True)
+            rows = list(rows_of(found, options))
+            save("gpu", rows, options, options.variant, PARTS, whole=True)
+    print(f"{time.monotonic() - start:.1f} s")
 
 
 def run_part(part: Part, limit: float, options: argparse.Namespace, folder: Path) -> Record:
-    """What a part found, with ``seconds``, ``device_mib`` and, if it failed, ``error``."""
+    """What a part found, with what it ``took`` and, if it failed, an ``error``."""
     file = folder / f"{part.name}.json"
     command = [sys.executable, "-m", "tests.benchmarks.gpu_parts", part.function or part.name]
     command += ["--name", part.name, "--variant", options.variant, "--folder", str(folder)]
@@ -122,7 +150,7 @@ def run_part(part: Part, limit: float, options: argparse.Namespace, folder: Path
             found = json.loads(file.read_text()) if file.exists() else {}
             if error and "error" not in found:
                 found["error"] = error
-    found["seconds"] = round(time.monotonic() - start, 1)
+    found["took"] = round(time.monotonic() - start, 1)
     if peak:
         found["device_mib"] = max(peak)
     return found
@@ -156,7 +184,7 @@ def _watched_memory(variant: str) -> Iterator[list[int]]:
 
     def watch() -> None:
         while not done.wait(_POLL):
-            if (used := query_device("memory.used")) is not None:
+            if (used := gpu_query("memory.used")) is not None:
                 seen.append(int(used.split()[0]))
 
     thread = threading.Thread(target=watch, daemon=True)
@@ -170,22 +198,9 @@ def _watched_memory(variant: str) -> Iterator[list[int]]:
             thread.join()
 
 
-def query_device(what: str) -> str | None:
-    """What ``nvidia-smi`` says of the first device; nothing where it does not work."""
-    command = ["nvidia-smi", f"--query-gpu={what}", "--format=csv,noheader,nounits"]
-    try:
-        found = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    lines = found.stdout.splitlines()
-    return lines[0].strip() if lines else None
-
-
-def _require_device(record: Record, options: argparse.Namespace) -> None:
+def _require_device(found: Record, options: argparse.Namespace) -> None:
     """Ends with a sentence where the variant does not work."""
-    found = record["parts"]["device"]
-    record["machine"] = found.pop("machine", None)
-    if record["machine"] is None:
+    if found.pop("machine", None) is None:
         reason = found.get("error", "no reason was given")
         sys.exit(
             f"{options.variant} does not work on this machine ({reason}), expected an NVIDIA GPU "
@@ -193,12 +208,62 @@ def _require_device(record: Record, options: argparse.Namespace) -> None:
         )
 
 
-def write_result(path: Path, record: Record) -> None:
-    """Puts the record in its file, whole."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_suffix(".part")
-    draft.write_text(json.dumps(record, indent=1) + "\n")
-    draft.replace(path)
+# ---- Rows ---------------------------------------------------------------------------
+
+
+def rows_of(found: Mapping[str, Record], options: argparse.Namespace) -> Iterator[Row]:
+    """A row of every part, and of every kind of steps."""
+    kinds = {part.name: part for part in parts(options)}
+    size = "32×32" if options.small else "800×800"
+    for name, record in found.items():
+        part = kinds[name]
+        if part.function == "train":
+            half = ", half precision" if "--half" in part.arguments else ""
+            what = f"`fast`{half}, trained for {part.arguments[1]} s"
+        else:
+            what = {
+                "device": "the device",
+                "tests": f"tests marked `{record.get('marks')}`",
+                "data": "the images",
+                "render": f"a frame by mi.render, {size}",
+                "steps": "profiles of training steps",
+            }[name]
+        yield _row(what, record, _protocol(record, found.get("data", {})))
+        if name == "steps":
+            for kind, steps in record.items():
+                if isinstance(steps, dict):
+                    took = {"took": 0.0} if "step_ms" not in steps else {}
+                    yield _row(f"steps: {kind}", {**took, **steps})
+
+
+def _row(what: str, record: Mapping[str, Any], protocol: Protocol | None = None) -> Row:
+    figures = {}
+    for key, (name, unit) in _FIGURES.items():
+        if record.get(key) is not None:
+            spread = [record[k] for k in _SPREADS.get(key, ()) if k in record]
+            limits = (spread[0], spread[1]) if len(spread) == 2 else None
+            figures[name] = Figure(float(record[key]), unit, limits)
+    for name, milliseconds in record.get("stages", {}).items():
+        figures[f"stage_{name}"] = Figure(milliseconds, "ms")
+    notes = {key: record[key] for key in _NOTES if record.get(key)}
+    return Row({"what": what, "notes": _said(notes) or "–"}, figures, protocol)
+
+
+def _protocol(record: Mapping[str, Any], images: Mapping[str, Any]) -> Protocol | None:
+    if "psnr" not in record:
+        return None
+    width, height = record["size"]
+    return Protocol(images["images"], record["split"], record["views"], (width, height))
+
+
+def _said(notes: Mapping[str, Any]) -> str:
+    """Words in one line, folders of this machine and what a table would break at left out."""
+    parts = []
+    for key, value in notes.items():
+        words = "; ".join(value) if isinstance(value, list) else str(value)
+        parts.append(words if key in ("driver", "images") else f"{key}: {words}")
+    text = re.sub(r"(?<![\w.])/[^\s:;,()'\"]*/", "", "; ".join(parts))
+    return text.replace("|", "/").strip()[:1000]
 
 
 def _line(found: Record) -> str:

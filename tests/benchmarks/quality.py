@@ -10,27 +10,12 @@ it to docs/results/quality.json.
 from __future__ import annotations
 
 import argparse
-import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
-from typing import Any
-
-import numpy as np
 
 from mi_nerf.base.variants import choose_variant
-from tests.benchmarks import data_folder, machine
-from tests.benchmarks.results import TRAINING, Protocol, Row, add_options, mean_of, save
-
-_UNITS = {
-    "psnr": "dB",
-    "ssim": "",
-    "steps": "",
-    "queries_per_ray": "",
-    "seconds_per_view": "s",
-    "restarts": "",
-}
+from tests.benchmarks import data_folder, machine, trained
+from tests.benchmarks.results import TRAINING, add_options, save
 
 
 def main() -> None:
@@ -47,74 +32,34 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[])
     add_options(parser)
     options = parser.parse_args()
-    data = data_folder(options.data)
+    data, preset = data_folder(options.data), " ".join([options.preset, *options.set])
     print(machine())
     print(
-        f"{options.data}, downscale {options.downscale}, split {options.split}, "
-        f"preset {options.preset} {' '.join(options.set)}, {options.seconds:g} s of training, "
-        f"{options.views or 'all'} views"
+        f"{options.data}, downscale {options.downscale}, split {options.split}, preset {preset}, "
+        f"{options.seconds:g} s of training, {options.views or 'all'} views"
     )
-    results = []
-    for seed in range(options.first_seed, options.first_seed + options.seeds):
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    evaluate = ["--split", options.split]
+    evaluate += ["--views", str(options.views)] if options.views else []
+    runs = []
+    for seed in seeds:
+        train = ["--preset", options.preset, "--seed", str(seed)]
+        train += ["--max-seconds", str(options.seconds), "--downscale", str(options.downscale)]
+        train += ["--set", *options.set] if options.set else []
         with tempfile.TemporaryDirectory() as folder:
-            results.append(_train_and_evaluate(data, Path(folder), seed, options))
-        print(f"seed {seed}: {_line(results[-1])}", flush=True)
-    mean = {key: float(np.mean([r[key] for r in results])) for key in _UNITS}
-    print(f"mean of {options.seeds}: {_line(mean)}")
-    save("quality", [_row(results, options)], options, choose_variant(), TRAINING)
-
-
-def _row(results: list[dict[str, Any]], options: argparse.Namespace) -> Row:
-    width, height = results[0]["size"]
-    return Row(
-        {
-            "data": options.data,
-            "preset": " ".join([options.preset, *options.set]),
-            "size": f"{width}×{height}",
-            "time": f"{options.seconds:g} s",
-        },
-        {key: mean_of([r[key] for r in results], unit) for key, unit in _UNITS.items()},
-        Protocol(options.data, options.split, results[0]["views"], (width, height)),
-        tuple(range(options.first_seed, options.first_seed + options.seeds)),
-    )
-
-
-def _train_and_evaluate(
-    data: Path, folder: Path, seed: int, options: argparse.Namespace
-) -> dict[str, Any]:
-    run, record = folder / "run", folder / "eval.json"
-    command = [sys.executable, "-m", "mi_nerf.cli"]
-    train = ["train", str(data), "--out", str(run), "--seed", str(seed)]
-    train += ["--max-seconds", str(options.seconds), "--downscale", str(options.downscale)]
-    train += ["--preset", options.preset]
-    if options.set:
-        train += ["--set", *options.set]
-    subprocess.run(command + train, check=True, stdout=subprocess.DEVNULL)
-    evaluate = ["eval", str(run), "--split", options.split, "--json", str(record)]
-    if options.views:
-        evaluate += ["--views", str(options.views)]
-    subprocess.run(command + evaluate, check=True, stdout=subprocess.DEVNULL)
-    result = json.loads(record.read_text())
-    log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
-    return {
-        "size": result["size"],
-        "views": result["views"],
-        "psnr": result["mean"]["psnr"],
-        "ssim": result["mean"]["ssim"],
-        "steps": log[-1]["step"],
-        "queries_per_ray": result["queries_per_ray"],
-        "seconds_per_view": result["seconds_per_view"],
-        "restarts": sum(line.get("event") == "restart" for line in log),
+            runs.append(trained.by_command(data, Path(folder), train, evaluate))
+        print(f"seed {seed}: {trained.line(runs[-1])}", flush=True)
+    width, height = runs[0]["size"]
+    labels = {
+        "data": options.data,
+        "preset": preset,
+        "size": f"{width}×{height}",
+        "time": f"{options.seconds:g} s",
     }
-
-
-def _line(result: dict[str, float]) -> str:
-    return (
-        f"{result['psnr']:.2f} dB, SSIM {result['ssim']:.4f}, {result['steps']:.0f} steps, "
-        f"{result['queries_per_ray']:.1f} queries a ray, "
-        f"{result['seconds_per_view']:.3f} s a view, "
-        f"{result['restarts']:g} restarts"
-    )
+    row = trained.row(labels, runs, options.data, seeds)
+    means = {name: figure.value for name, figure in row.figures.items()}
+    print(f"mean of {options.seeds}: {trained.line(means)}")
+    save("quality", [row], options, choose_variant(), TRAINING)
 
 
 if __name__ == "__main__":

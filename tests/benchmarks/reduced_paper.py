@@ -14,28 +14,17 @@ protocol. How long the published model itself would take with these images is me
 from __future__ import annotations
 
 import argparse
-import json
-import sys
 import tempfile
-from dataclasses import replace
-from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from mi_nerf import generation
-from mi_nerf.base.machine import machine, machine_line
 from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.data import load_dataset, split_to_measure
 from mi_nerf.scene_xml.library import find_scene
-from mi_nerf.tasks.evaluate import evaluate
-from mi_nerf.training import run as training
-from mi_nerf.training.config import with_settings
 from mi_nerf.training.forecast import PUBLISHED_STEPS, duration, step_seconds
 from mi_nerf.training.presets import preset
-from mi_nerf.training.run_folder import LOG
-from tests.benchmarks import data_folder
-from tests.benchmarks.gpu import write_result
-from tests.benchmarks.results import commit
+from tests.benchmarks import data_folder, machine, trained
+from tests.benchmarks.results import TRAINING, Figure, Row, add_options, save
 
 REDUCED = ["network.width=64", "network.view_width=32", "sampling.rays=256"]
 REDUCED += ["sampling.samples=32", "sampling.fine=64", "sampling.render_samples=32"]
@@ -52,29 +41,30 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="how many")
     parser.add_argument("--views", type=int, default=25)
     parser.add_argument("--set", nargs="*", default=[], help="changes, as of mi-nerf train")
+    parser.add_argument("--no-published", action="store_true", help="do not time that one")
     parser.add_argument("--variant")
-    parser.add_argument("--out", type=Path, help="a JSON file of what was found")
+    add_options(parser)
     options = parser.parse_args()
     variant = choose_variant(options.variant)
-    record: dict[str, Any] = {
-        "command": " ".join(["python -m tests.benchmarks.reduced_paper", *sys.argv[1:]]),
-        "commit": commit(),
-        "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        "machine": machine(variant),
-        "settings": [*REDUCED, *options.set],
-        "runs": [],
-    }
-    budget = f"{options.steps} steps" if options.steps else f"{options.seconds:g} s"
-    print(f"{machine_line(record['machine'])}; {' '.join(record['settings'])}; {budget} a run")
+    budget = f"{options.steps:,} steps" if options.steps else f"{options.seconds:g} s"
+    print(f"{machine()}, {variant}; {' '.join([*REDUCED, *options.set])}; {budget} a run")
     with tempfile.TemporaryDirectory() as folder:
         data = _data(options, Path(folder), variant)
-        record["published"] = _published(data, options, variant)
+        if not options.no_published:
+            published = _published(data, options, variant)
+            save("reduced_paper", [published], options, variant, TRAINING)
+        runs = []
         for seed in range(options.seeds):
-            found = _trained(data, Path(folder) / f"run_{seed}", seed, options, variant)
-            record["runs"].append(found)
-            print(f"seed {seed}: {_line(found)}", flush=True)
-            if options.out:
-                write_result(options.out, record)
+            runs.append(_trained(data, Path(folder) / f"seed_{seed}", seed, options, variant))
+            print(f"seed {seed}: {trained.line(runs[-1])}", flush=True)
+    model = ", ".join(["reduced", *options.set])
+    labels = {"model": model, "images": _images(data, runs[0]["size"]), "time": budget}
+    row = trained.row(labels, runs, data.name, range(options.seeds))
+    save("reduced_paper", [row], options, variant, TRAINING)
+
+
+def _images(data: Path, size: tuple[int, int]) -> str:
+    return f"{data.name}, {size[0]}×{size[1]}"
 
 
 def _data(options: argparse.Namespace, folder: Path, variant: str) -> Path:
@@ -89,55 +79,33 @@ def _data(options: argparse.Namespace, folder: Path, variant: str) -> Path:
     return place
 
 
-def _published(data: Path, options: argparse.Namespace, variant: str) -> dict[str, Any]:
+def _published(data: Path, options: argparse.Namespace, variant: str) -> Row:
     """What the whole preset would take with these images."""
     dataset = load_dataset(data, "train", downscale=options.downscale, limit=10)
     seconds = step_seconds(preset("paper"), dataset, array_module(variant))
-    steps = PUBLISHED_STEPS["paper"]
+    count = PUBLISHED_STEPS["paper"]
     print(
-        f"the published model: {seconds:.3g} s a step, {steps:,} steps would take about "
-        f"{duration(seconds * steps)}",
+        f"the published model: {seconds:.3g} s a step, {count:,} steps would take about "
+        f"{duration(seconds * count)}",
         flush=True,
     )
-    return {"step_seconds": seconds, "steps": steps, "seconds": seconds * steps}
+    size = (dataset.intrinsics.width, dataset.intrinsics.height)
+    labels = {"model": "as published", "images": _images(data, size), "time": f"{count:,} steps"}
+    whole = Figure(seconds * count / 86400, "days")
+    return Row(labels, {"step": Figure(seconds, "s"), "whole": whole})
 
 
 def _trained(
     data: Path, folder: Path, seed: int, options: argparse.Namespace, variant: str
-) -> dict[str, Any]:
+) -> dict[str, object]:
     """One run and its quality."""
-    config = with_settings(preset("paper"), [*REDUCED, *options.set])
-    config = replace(config, seed=seed, downscale=options.downscale)
-    limit = None if options.steps else options.seconds
-    config = replace(config, steps=options.steps, max_seconds=limit)
-    run = training.start(data, folder, config, variant)
-    run.train(show_bar=False)
-    split = split_to_measure(data, None)
-    measured = evaluate(run, split=split, views=options.views)
-    log = [json.loads(line) for line in (folder / LOG).read_text().splitlines()]
-    return {
-        "seed": seed,
-        "split": split,
-        "views": len(measured["images"]),
-        "psnr": measured["mean"]["psnr"],
-        "ssim": measured["mean"]["ssim"],
-        "steps": run.trainer.step_count,
-        "seconds": run.seconds,
-        "learning_rate": log[-1]["learning_rate"],
-        "parameters": run.field_file().parameter_count(),
-        "queries_per_ray": measured["queries_per_ray"],
-        "seconds_per_view": measured["seconds_per_view"],
-        "restarts": sum(line.get("event") == "restart" for line in log),
-    }
-
-
-def _line(found: dict[str, Any]) -> str:
-    return (
-        f"{found['psnr']:.2f} dB, SSIM {found['ssim']:.4f} ({found['views']} views of "
-        f"{found['split']}), {found['steps']} steps in {duration(found['seconds'])}, learning rate "
-        f"{found['learning_rate']:.2g} at the end, {found['parameters']} parameters, "
-        f"{found['restarts']} restarts"
-    )
+    folder.mkdir()
+    train = ["--preset", "paper", "--seed", str(seed), "--variant", variant]
+    train += ["--downscale", str(options.downscale), "--set", *REDUCED, *options.set]
+    steps, seconds = ["--steps", str(options.steps)], ["--max-seconds", str(options.seconds)]
+    train += steps if options.steps else seconds
+    evaluate = ["--split", split_to_measure(data, None), "--views", str(options.views)]
+    return trained.by_command(data, folder, train, [*evaluate, "--variant", variant])
 
 
 if __name__ == "__main__":

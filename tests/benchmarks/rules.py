@@ -2,13 +2,14 @@
 
     python -m tests.benchmarks.rules --plot docs/convergence.png
     python -m tests.benchmarks.rules runs/lego --views 10
+    MI_NERF_DATA=… python -m tests.benchmarks.rules --preset fast
 
 Without a run: fields with known integrals in float64, 200 rays. Opacity is the same for all
 rules where samples lie in the middle of their strata; depth, the integral of an emission
 that grows with t, tells them apart. Then samples jittered as in training.
 
 With a run: rays of its held-out views, on white, against 4096 samples a ray of the same
-field, through the run's occupancy grid.
+field, through the run's occupancy grid. With a preset, lego_200 is trained for it at half its size.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -33,8 +35,10 @@ from mi_nerf.march.query import Evaluation
 from mi_nerf.march.rules import Rule
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.tasks.target import open_target
+from mi_nerf.training import run as training
 from mi_nerf.training.batches import RayBatch, RaySource, step_rng
-from tests.benchmarks import machine
+from mi_nerf.training.presets import preset
+from tests.benchmarks import data_folder, machine
 from tests.benchmarks.results import (
     QUADRATURE,
     TRAINING,
@@ -59,6 +63,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("run", nargs="?", help="folder of a run; by default, closed forms")
+    parser.add_argument("--preset", help="train one in its place")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of that training")
     parser.add_argument("--plot", type=Path, help="picture of error against samples")
     parser.add_argument("--split", default="val")
     parser.add_argument("--views", type=int, default=10)
@@ -69,11 +75,12 @@ def main() -> None:
     variant = choose_variant(options.variant)
     backend = array_module(variant)
     print(f"{machine()}, {variant}\n")
-    if options.run is None:
+    if options.run is None and options.preset is None:
         save("rules", closed_forms(backend, options.plot), options, variant, QUADRATURE, whole=True)
-    else:
-        rows = trained(backend, options)
-        save("rules_trained", rows, options, variant, TRAINING)
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        options.run = options.run or _train(Path(folder), variant, options)
+        save("rules_trained", trained(backend, options), options, variant, TRAINING)
 
 
 # ---- Closed forms -------------------------------------------------------------
@@ -150,6 +157,15 @@ def _draw(path: Path, columns: dict[str, Callable[[str, int], float]]) -> None:
 
 
 # ---- Trained fields -------------------------------------------------------------
+
+
+def _train(folder: Path, variant: str, options: argparse.Namespace) -> Path:
+    """A run of the preset, whose folder has its name."""
+    config = preset(options.preset)
+    config = replace(config, max_seconds=options.seconds, downscale=2)
+    run = training.start(data_folder("lego_200"), folder / options.preset, config, variant)
+    run.train(show_bar=False)
+    return run.folder
 
 
 def trained(backend: Any, options: argparse.Namespace) -> list[Row]:

@@ -1,15 +1,14 @@
 """Seconds from the start of the process until the first training step has been computed.
 
-    python -m tests.benchmarks.startup
-    python -m tests.benchmarks.startup --data lego_800 --downscale 1
-    python -m tests.benchmarks.startup --against ../0.1.0
+    MI_NERF_DATA=… python -m tests.benchmarks.startup --against ../before
+    MI_NERF_DATA=… python -m tests.benchmarks.startup --data lego_800 --downscale 1
 
 Starts `mi-nerf train DATA --preset PRESET --steps 1`, DATA below MI_NERF_DATA, in processes of
 their own: with an empty cache of kernels, then with what that has left there. The log says when
 the step's results had been read. With --against, the checkout of another version takes turns, so
-that whatever else the machine does weighs on both. Prints the medians of all repetitions (with
-seeds 0, 1, …) and their range; below them the processes' CPU seconds, which a busy machine
-changes less, and which saving the run and leaving are part of.
+that whatever else the machine does weighs on both. Medians of all repetitions (with seeds 0, 1,
+…) and their range; beside them the processes' CPU seconds, which a busy machine changes less,
+and which saving the run and leaving are part of.
 """
 
 from __future__ import annotations
@@ -18,57 +17,68 @@ import argparse
 import json
 import os
 import resource
-import statistics
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
-from tests.benchmarks import data_folder, machine
+from mi_nerf.base.variants import choose_variant
+from mi_nerf.data import load_dataset
+from mi_nerf.training.run_folder import LOG
+from tests.benchmarks import checkout, data_folder, machine
+from tests.benchmarks.results import TRAINING, Figure, Row, add_options, median_of, save
 
-HERE = Path(__file__).parents[2]
+# Everything that is imported on the way.
+PARTS = tuple(sorted({*TRAINING, "base", "commands", "fields", "formats", "tasks"}))
+Seconds = tuple[float, float]  # of the clock, and of the CPU
 
 
-def main(arguments: list[str] | None = None) -> dict[str, Any]:
-    """Prints the table; returns its figures by version, preset and state of the cache."""
+def main() -> None:
+    """Times all presets."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--data", default="lego_200", help="a folder below MI_NERF_DATA")
     parser.add_argument("--downscale", type=int, default=2)
     parser.add_argument("--presets", nargs="*", default=["fast", "nerf"])
     parser.add_argument("--repeat", type=int, default=3)
-    parser.add_argument("--against", type=Path, help="a checkout of another version")
-    options = parser.parse_args(arguments)
+    checkout.add_options(parser)
+    add_options(parser)
+    options = parser.parse_args()
     data = data_folder(options.data).resolve()
-    trees = {"this": HERE} | ({"other": options.against.resolve()} if options.against else {})
-    result: dict[str, Any] = {"data": options.data, "downscale": options.downscale}
-    print(f"{machine()}; {options.data}, downscale {options.downscale}")
+    size = load_dataset(data, "train", downscale=options.downscale, limit=1).intrinsics
+    images = f"{options.data}, {size.width}×{size.height}"
+    print(f"{machine()}; {images}")
     for preset in options.presets:
-        found: dict[str, dict[str, list[tuple[float, float]]]] = {}
-        for seed in range(options.repeat):
-            for name, tree in trees.items():
-                with tempfile.TemporaryDirectory() as home:
-                    train = [str(data), "--preset", preset, "--downscale", str(options.downscale)]
-                    for cache in ("empty", "warm"):
-                        first = first_step(tree, [*train, "--seed", str(seed)], Path(home))
-                        found.setdefault(name, {}).setdefault(cache, []).append(first)
-        for name, caches in found.items():
-            for cache, pairs in caches.items():
-                figures = _summary(pairs)
-                result.setdefault(name, {}).setdefault(preset, {})[cache] = figures
-                low, high = figures["range"]
-                print(
-                    f"{name} version, {preset}, {cache} cache: {figures['seconds']:.2f} s "
-                    f"({low:.2f} to {high:.2f}), {figures['cpu_seconds']:.2f} s of CPU",
-                    flush=True,
-                )
-        for cache in ("empty", "warm") if options.against else ():
-            mine, other = (result[name][preset][cache]["seconds"] for name in ("this", "other"))
-            print(f"this / other, {preset}, {cache} cache: {mine / other:.2f}")
-    return result
+        _compare(preset, data, images, options)
 
 
-def first_step(tree: Path, train: list[str], home: Path) -> tuple[float, float]:
+def _compare(preset: str, data: Path, images: str, options: argparse.Namespace) -> None:
+    """Starts one preset with all checkouts in turns, and saves their rows."""
+    places = checkout.versions(options)
+    found: dict[tuple[str, str], list[Seconds]] = {}  # of a version and a state of the cache
+    train = [str(data), "--preset", preset, "--downscale", str(options.downscale)]
+    for seed in range(options.repeat):
+        for version, folder in places.items():
+            with tempfile.TemporaryDirectory() as home:
+                for cache in ("empty", "warm"):
+                    seconds = first_step(folder, [*train, "--seed", str(seed)], Path(home))
+                    found.setdefault((version, cache), []).append(seconds)
+    for (version, cache), pairs in found.items():
+        wall, cpu = (median_of(values, "s") for values in zip(*pairs, strict=True))
+        figures = {"seconds": wall, "cpu_seconds": cpu}
+        if version == "this" and len(places) > 1:
+            before = [seconds for seconds, _ in found[options.against_name, cache]]
+            figures["ratio"] = Figure(wall.value / median_of(before).value)
+        print(
+            f"{preset}, {cache} cache, {version}: "
+            + ", ".join(f"{name} {figure.value:.2f}" for name, figure in figures.items()),
+            flush=True,
+        )
+        labels = {"images": images, "preset": preset, "cache": cache, "version": version}
+        row = Row(labels, figures, seeds=tuple(range(options.repeat)))
+        save("startup", [row], options, choose_variant(), PARTS, checkout=places[version])
+
+
+def first_step(tree: Path, train: list[str], home: Path) -> Seconds:
     """Wall-clock seconds until the first step's results were read; CPU seconds of it all.
 
     Args:
@@ -83,26 +93,15 @@ def first_step(tree: Path, train: list[str], home: Path) -> tuple[float, float]:
         subprocess.run(
             [*command, "--steps", "1"],
             cwd=tree,
-            env={**os.environ, "HOME": str(home)},
+            env={**os.environ, "HOME": str(home), "PYTHONPATH": str(tree)},
             stdout=subprocess.DEVNULL,
             check=True,
         )
-        line = json.loads((out / "log.jsonl").read_text().splitlines()[0])
+        line = json.loads((out / LOG).read_text().splitlines()[0])
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     assert line["step"] == 1
     cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return float(line["seconds"]), cpu
-
-
-def _summary(pairs: list[tuple[float, float]]) -> dict[str, Any]:
-    """Of several repetitions, (wall-clock, CPU) seconds each."""
-    wall = [seconds for seconds, _ in pairs]
-    return {
-        "seconds": statistics.median(wall),
-        "range": [min(wall), max(wall)],
-        "cpu_seconds": statistics.median(cpu for _, cpu in pairs),
-        "repetitions": len(pairs),
-    }
 
 
 if __name__ == "__main__":
