@@ -31,7 +31,7 @@ def data_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("words", "name", "labels", "figures"),
     [
-        ("quality --seconds 2 --seeds 2 --preset fast", "quality", ["lego_200"], ["psnr"]),
+        ("quality --seconds 1 --seeds 1 --preset fast", "quality", ["lego_200"], ["psnr"]),
         (
             "reduced_paper --steps 3 --no-published --set " + " ".join(TINY),
             "reduced_paper",

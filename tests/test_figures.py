@@ -57,11 +57,11 @@ def test_every_file_is_shown_somewhere() -> None:
 
 
 def test_measured_numbers_stand_in_tables_alone() -> None:
-    """Two decimals of a decibel, or milliseconds, rates and memory, in the pages on figures."""
+    """Two decimals of a decibel, milliseconds, rates, memory and shares, in pages on figures."""
     pages = ("README", "figures", "training", "quadrature", "stability")
     for page in (page for page in PAGES if page.stem in pages):
         rest = BLOCK.sub("", page.read_text())
-        found = re.findall(r"\d\.\d\d dB|\d ?ms\b|\d GFLOP/s|\d MB\b", rest)
+        found = re.findall(r"\d\.\d\d dB|\d ?ms\b|\d GFLOP/s|\d MB\b|\d ?%", rest)
         found = [number for number in found if number != NOISE]
         assert not found, f"{page.name}: {found}"
     assert "figures: quality" in (ROOT / "README.md").read_text()
