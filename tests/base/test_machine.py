@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mi_nerf.base.machine import available_memory
+from mi_nerf.base.machine import available_memory, gpu_query, machine
 
 THERE = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 LIMIT = 1 << 20  # less than any machine has
@@ -49,3 +49,18 @@ def test_version_1(tmp_path: Path, limited: str) -> None:
 
 def test_this_machine() -> None:
     assert 0 < available_memory() <= THERE
+
+
+def test_a_card_is_named_by_its_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = tmp_path / "nvidia-smi"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert gpu_query("name") is None, "there is no such program"
+    program.write_text('#!/bin/sh\necho "what was asked: $1"\necho "of another card"\n')
+    program.chmod(0o755)
+    asked = "what was asked: --query-gpu=name"
+    assert gpu_query("name") == asked
+    if not Path("/proc/driver/nvidia").exists():
+        assert machine("cuda_ad_rgb")["gpu"] == asked
+    assert machine("llvm_ad_rgb")["gpu"] is None
+    program.write_text("#!/bin/sh\necho no devices were found\nexit 6\n")
+    assert gpu_query("name") is None

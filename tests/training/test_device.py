@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import drjit as dr
+import numpy as np
 import pytest
 from drjit import nn
 
@@ -60,20 +61,25 @@ def test_half_precision_refuses_large_blocks() -> None:
         with_settings(preset("fast"), settings)
 
 
-def test_cooperative_vectors_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By packing one: Dr.Jit refuses that where driver or OptiX do not know them."""
+@pytest.mark.parametrize("refusing", ["pack", "CoopVec", "matvec"])
+def test_cooperative_vectors_are_tried_out(refusing: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a product: a driver that is too old refuses one part of it, a missing OptiX another."""
     import drjit.llvm.ad as arrays
 
     assert not variants.has_cooperative_vectors("llvm_ad_rgb")
     monkeypatch.setattr(variants, "available_variants", lambda: [CUDA])
     monkeypatch.setattr(variants, "array_module", lambda variant: arrays)
+    variants.multiplies_in_half.cache_clear()
     assert variants.has_cooperative_vectors(CUDA)
 
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise RuntimeError("jit_coop_vec_pack(): ... requires CUDA 12.8 or newer")
 
-    monkeypatch.setattr(nn, "CoopVec", refuse)
+    monkeypatch.setattr(nn, refusing, refuse)
+    assert variants.has_cooperative_vectors(CUDA), "asked once"
+    variants.multiplies_in_half.cache_clear()
     assert not variants.has_cooperative_vectors(CUDA)
+    variants.multiplies_in_half.cache_clear()
 
 
 @pytest.mark.cuda
@@ -81,9 +87,16 @@ def test_cooperative_vectors_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_answer_holds_on_this_device() -> None:
     from importlib import import_module
 
-    half = import_module("drjit.cuda.ad").Float16
+    arrays = import_module("drjit.cuda.ad")
+    matrix = np.array([[1, 2], [3, 4], [5, 6]], np.float16)
+
+    def product() -> list[float]:
+        views = nn.pack({"matrix": arrays.TensorXf16(matrix)}, layout="inference")
+        vector = nn.CoopVec(arrays.Float16([1, 0]), arrays.Float16([2, 1]))
+        return [float(x[0]) for x in nn.matvec(views["matrix"], vector)]
+
     if variants.has_cooperative_vectors(CUDA):
-        assert [float(x[0]) for x in nn.CoopVec(half(1), half(2))] == [1, 2]
+        assert product() == [5, 11, 17]
     else:
         with pytest.raises(RuntimeError):
-            nn.CoopVec(half(1), half(2))
+            product()
