@@ -26,23 +26,29 @@ _LARGEST = 65504.0  # of half precision
 _MARGIN = 0.9  # of it, that sums with rounding errors stay below
 
 
+def worth_fusing(config: NetworkConfig, float_type: Any) -> bool:
+    """Whether a network is narrow enough, and the device one with such products."""
+    widest = max(layer.outputs for layer in config.layers())
+    if widest > WIDEST or dr.type_v(float_type) != dr.VarType.Float32:
+        return False
+    if dr.backend_v(float_type) == dr.JitBackend.LLVM:
+        return True
+    return multiplies_in_half(dr.float16_array_t(float_type))
+
+
 def fused_network(config: NetworkConfig, weights: Mapping[str, Any]) -> FusedNetwork | None:
     """The network as one kernel, or ``None`` where that would be slower or wrong.
 
-    On a GPU that is in half precision, where tensor cores can be had and no activation can
-    overflow. While ``dr.freeze`` records, weights cannot be looked at to know that.
+    On a GPU it is in half precision, if no activation can overflow. While ``dr.freeze`` records,
+    weights cannot be looked at to know that.
     """
-    array = next(iter(weights.values())).array
-    widest = max(layer.outputs for layer in config.layers())
-    if widest > WIDEST or dr.type_v(array) != dr.VarType.Float32:
+    float_type = type(next(iter(weights.values())).array)
+    half = dr.backend_v(float_type) != dr.JitBackend.LLVM
+    if half and dr.flag(dr.JitFlag.FreezingScope) or not worth_fusing(config, float_type):
         return None
-    if dr.backend_v(array) == dr.JitBackend.LLVM:
-        return FusedNetwork(config, weights)
-    if dr.flag(dr.JitFlag.FreezingScope) or not multiplies_in_half(dr.float16_array_t(type(array))):
+    if half and max(activation_bounds(config, weights).values()) > _MARGIN * _LARGEST:
         return None
-    if max(activation_bounds(config, weights).values()) > _MARGIN * _LARGEST:
-        return None
-    return FusedNetwork(config, weights, half=True)
+    return FusedNetwork(config, weights, half=half)
 
 
 def activation_bounds(config: NetworkConfig, weights: Mapping[str, Any]) -> dict[str, float]:
