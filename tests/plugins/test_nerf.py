@@ -74,13 +74,6 @@ def test_the_package_may_be_reloaded(field: Path) -> None:
     assert render(scene_dict(field)).shape == (12, 16, 4)
 
 
-def test_other_colour_modes_are_refused(field: Path) -> None:
-    mi.set_variant("llvm_ad_spectral")
-    with pytest.raises(RuntimeError, match="llvm_ad_spectral.*expected 'llvm_ad_rgb'"):
-        mi.load_dict({"type": "nerf"})
-    mi.set_variant("llvm_ad_rgb")
-
-
 @pytest.mark.parametrize(
     ("integrator", "message"),
     [
