@@ -8,6 +8,7 @@ linear in the values, so that no pass needs to know another one's.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -72,6 +73,9 @@ class FieldIntegrator(ADIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.near, self.far = props.get("near", None), props.get("far", None)
+        for name, value in (("near", self.near), ("far", self.far)):
+            if value is not None and math.isnan(value):
+                raise self._unlike(name, value, "a distance")
         # Read by the base class in C++; kept here for the background.
         self.show_background = not bool(props.get("hide_emitters", False))
         self.aovs = self._parse_aovs(str(props.get("aovs", "")))

@@ -232,7 +232,7 @@ def test_variant_of_another_machine(
 ) -> None:
     monkeypatch.setattr(backend, "available_variants", lambda: ["llvm_ad_rgb"])
     message = refused("eval", blob_run, "--variant", "cuda_ad_rgb")
-    assert "'cuda_ad_rgb': does not work on this machine, expected one such as 'llvm_ad_rgb'" in message
+    assert "'cuda_ad_rgb': does not work on this machine, expected one such as 'llvm_ad" in message
 
 
 def test_info_works_without_a_backend(
