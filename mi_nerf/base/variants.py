@@ -48,20 +48,24 @@ def choose_variant(requested: str | None = None) -> str:
     if requested is not None and (why := unsuitable(requested)) is not None:
         raise InputError(f"variant '{requested}': {why}{_such_as(available)}")
     if not available:
-        raise InputError(
-            f"no usable backend: expected an NVIDIA GPU, or an LLVM library (version {SOUND} or "
-            f"newer) that DRJIT_LIBLLVM_PATH may point at, {where_llvm_is()}"
-        )
+        raise InputError(f"no usable backend: expected an NVIDIA GPU, or {_an_llvm()}")
     if requested is not None and requested not in available:
-        raise InputError(
-            f"variant '{requested}': does not work on this machine, expected one"
-            f"{_such_as(available)}"
-        )
+        lacking = "expected one" + _such_as(available)
+        if _prefix(requested) == "llvm" and not _works(requested):
+            lacking = f"expected {_an_llvm()}"
+        raise InputError(f"variant '{requested}': does not work on this machine, {lacking}")
     return requested or available[0]
 
 
 def _such_as(available: list[str]) -> str:
     return f" such as '{available[0]}'" if available else ""
+
+
+def _an_llvm() -> str:
+    return (
+        f"an LLVM library (version {SOUND} or newer) that DRJIT_LIBLLVM_PATH may point at, "
+        f"{where_llvm_is()}"
+    )
 
 
 def _prefix(variant: str) -> str:
