@@ -31,6 +31,14 @@ SYSTEM_FOLDERS = (
     "/usr/local/lib",
 )
 
+# What users may point the variable at, by ``sys.platform``; the package brings one for Linux on
+# x86-64 only. Homebrew's prefix is /usr/local on Intel Macs.
+PLACES = {
+    "linux": "such as /usr/lib/aarch64-linux-gnu/libLLVM.so.19.1 of the package libllvm19",
+    "darwin": "such as /opt/homebrew/opt/llvm/lib/libLLVM.dylib after 'brew install llvm'",
+    "win32": r"such as C:\Program Files\LLVM\bin\LLVM-C.dll of LLVM's own installer",
+}
+
 # e_machine of an ELF header.
 ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
 
@@ -41,6 +49,14 @@ def ensure_llvm() -> None:
         path = find_llvm()
         if path is not None:
             os.environ[VARIABLE] = path
+
+
+def where_llvm_is() -> str:
+    """An example of what the variable may name on this system."""
+    place = PLACES.get(sys.platform, "a shared library")
+    if sys.platform == "linux":
+        place = place.replace("aarch64", os.uname().machine)
+    return place
 
 
 def find_llvm() -> str | None:

@@ -1,14 +1,18 @@
 """The search for LLVM, in folders made up for the test, and the startup file that runs it."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from mi_nerf import _llvm
+from mi_nerf.base import variants
+from mi_nerf.base.errors import InputError
 
 CHECKOUT = Path(__file__).parents[1]
 LINE = (CHECKOUT / "mi_nerf" / "_startup.pth").read_text()
@@ -286,3 +290,73 @@ def test_startup_makes_mitsubas_llvm_variants_work(tmp_path, monkeypatch):
         check=False,
     )
     assert (done.returncode, done.stdout) == (0, f"[2] {path}\n"), done.stderr
+
+
+# ---- Other systems ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("system", "machine", "brought"),
+    [
+        ("linux", "x86_64", True),
+        ("linux", "aarch64", False),
+        ("darwin", "arm64", False),
+        ("darwin", "x86_64", False),
+        ("win32", "AMD64", False),
+    ],
+)
+def test_only_linux_on_x86_64_brings_an_llvm(system, machine, brought):
+    """The wheel exists nowhere else: elsewhere the package must install without it."""
+    listed = re.search(
+        r"^dependencies = \[\n(.*?)^\]", (CHECKOUT / "pyproject.toml").read_text(), re.S | re.M
+    )[1]
+    environment = {"sys_platform": system, "platform_machine": machine, "python_version": "3.12"}
+    wanted = [
+        requirement.name
+        for requirement in map(Requirement, re.findall(r'^    "([^"]*)"', listed, re.M))
+        if requirement.marker is None or requirement.marker.evaluate(environment)
+    ]
+    assert ("karellen-llvm-core" in wanted) == brought
+    assert {"mitsuba", "drjit", "numpy"} < set(wanted)
+
+
+@pytest.mark.parametrize(
+    ("system", "example"),
+    [("darwin", "libLLVM.dylib"), ("win32", "LLVM-C.dll"), ("linux", "libLLVM.so.19.1")],
+)
+def test_without_llvm_one_sentence_says_what_to_point_at(monkeypatch, system, example):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.setattr(variants, "_works", lambda name: False)
+    for requested, said in ((None, "no usable backend"), ("llvm_ad_rgb", "no usable backend")):
+        with pytest.raises(InputError, match=said) as caught:
+            variants.choose_variant(requested)
+        sentence = str(caught.value)
+        assert _llvm.VARIABLE in sentence and example in sentence and "\n" not in sentence
+    # With a GPU beside it, who asks for LLVM is still told.
+    monkeypatch.setattr(variants, "_works", lambda name: name.startswith("cuda"))
+    assert variants.choose_variant() == "cuda_ad_rgb"
+    with pytest.raises(InputError, match=f"'llvm_ad_rgb': does not work.*{_llvm.VARIABLE}"):
+        variants.choose_variant("llvm_ad_rgb")
+
+
+@pytest.mark.slow
+def test_the_command_without_llvm(tmp_path):
+    """In a process that has none: Dr.Jit is pointed at a library that is not there."""
+    code = (
+        "import sys; from mi_nerf.cli import main; import drjit as dr; "
+        "assert not dr.has_backend(dr.JitBackend.LLVM); sys.exit(main(sys.argv[1:]))"
+    )
+    (tmp_path / "field.safetensors").write_bytes(b"")
+    arguments = ["render", "shell", "-o", "out.png", "--variant", "llvm_ad_rgb"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *arguments],
+        env=without_choice() | {_llvm.VARIABLE: "/missing.so", "PYTHONPATH": str(CHECKOUT)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    said = [line for line in done.stderr.splitlines() if line.startswith("mi-nerf: ")]
+    assert done.returncode == 2 and len(said) == 1, done.stderr
+    assert "no usable backend" in said[0] and _llvm.VARIABLE in said[0]

@@ -11,6 +11,8 @@ from typing import Any
 
 import drjit as dr
 
+_USUAL_MEMORY = 8 << 30  # bytes, where the system does not say how much there is
+
 
 def processor() -> str:
     """The name of the CPU, as far as the system tells it."""
@@ -35,7 +37,10 @@ def available_memory(system: Path = Path("/")) -> int:
     Args:
         system: the folder that holds ``proc`` and ``sys``.
     """
-    limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    try:
+        limits = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    except (AttributeError, ValueError):  # Windows does not say
+        limits = [_USUAL_MEMORY]
     for file in _memory_limits(system):
         try:
             limits.append(int(file.read_text()))

@@ -1,4 +1,10 @@
-"""Chooses where to compute: the GPU where there is one, the CPU otherwise."""
+"""Chooses where to compute: the GPU where there is one, the CPU otherwise.
+
+A Mitsuba variant is named backend, derivatives, colours and perhaps precision, as in
+``llvm_ad_spectral_polarized``. What is accepted is what has derivatives (``_ad_``) in single
+precision, in any colours: fields and their training know RGB only, and the plugins turn it into
+the colours of the variant (:mod:`mi_nerf.plugins.colors`).
+"""
 
 from __future__ import annotations
 
@@ -10,14 +16,27 @@ from typing import Any
 
 import drjit as dr
 
+from .._llvm import SOUND, where_llvm_is
 from .errors import InputError
 
-_BACKENDS = {"cuda_ad_rgb": dr.JitBackend.CUDA, "llvm_ad_rgb": dr.JitBackend.LLVM}
+_BEST = ("cuda", "llvm")  # backends; any other, as Metal, comes after what has been measured
+
+
+def unsuitable(variant: str) -> str | None:
+    """What keeps fields out of a variant, in words that go on after its name; or ``None``."""
+    if variant.endswith("_double"):
+        return "computes in double precision, expected a variant of single precision"
+    if "_ad_" not in variant:
+        return "has no derivatives, expected a variant with '_ad_' in its name"
+    return None
 
 
 def available_variants() -> list[str]:
-    """The supported Mitsuba variants that work on this machine, best first."""
-    return [name for name, backend in _BACKENDS.items() if dr.has_backend(backend)]
+    """The variants of this Mitsuba that work on this machine, best first."""
+    import mitsuba as mi
+
+    names = [name for name in mi.variants() if unsuitable(name) is None and _works(name)]
+    return sorted(names, key=lambda name: (not name.endswith("_rgb"), _rank(name)))
 
 
 def choose_variant(requested: str | None = None) -> str:
@@ -27,19 +46,42 @@ def choose_variant(requested: str | None = None) -> str:
         InputError: if it is not supported, or nothing is.
     """
     available = available_variants()
-    if requested is not None and requested not in _BACKENDS:
-        raise InputError(f"variant '{requested}': expected one of {', '.join(_BACKENDS)}")
+    if requested is not None and (why := unsuitable(requested)) is not None:
+        raise InputError(f"variant '{requested}': {why}{_such_as(available)}")
     if not available:
-        raise InputError(
-            "no usable backend: expected an NVIDIA GPU, or an LLVM library (version 17 or newer) "
-            "that DRJIT_LIBLLVM_PATH may point at"
-        )
+        raise InputError(f"no usable backend: expected an NVIDIA GPU, or {_an_llvm()}")
     if requested is not None and requested not in available:
-        raise InputError(
-            f"variant '{requested}': does not work on this machine, "
-            f"expected {' or '.join(available)}"
-        )
+        lacking = "expected one" + _such_as(available)
+        if _prefix(requested) == "llvm" and not _works(requested):
+            lacking = f"expected {_an_llvm()}"
+        raise InputError(f"variant '{requested}': does not work on this machine, {lacking}")
     return requested or available[0]
+
+
+def _such_as(available: list[str]) -> str:
+    return f" such as '{available[0]}'" if available else ""
+
+
+def _an_llvm() -> str:
+    return (
+        f"an LLVM library (version {SOUND} or newer) that DRJIT_LIBLLVM_PATH may point at, "
+        f"{where_llvm_is()}"
+    )
+
+
+def _prefix(variant: str) -> str:
+    return variant.partition("_")[0]
+
+
+def _rank(variant: str) -> int:
+    return _BEST.index(_prefix(variant)) if _prefix(variant) in _BEST else len(_BEST)
+
+
+def _works(variant: str) -> bool:
+    """Whether Dr.Jit can compute with the backend of a variant here, if it knows it at all."""
+    named = {name.lower(): name for name in dir(dr.JitBackend) if not name.startswith("_")}
+    title = named.get(_prefix(variant))
+    return title is not None and bool(dr.has_backend(getattr(dr.JitBackend, title)))
 
 
 def active_variant(requested: str | None = None) -> str:

@@ -58,6 +58,10 @@ def generate(
     Raises:
         InputError: if anything is not as expected; existing files are as they were.
     """
+    if "_mono" in variant:
+        raise InputError(
+            f"variant '{variant}': knows no colours, expected one that can make images of them"
+        )
     folder = Path(out)
     _check_output(folder, resume)
     with using_variant(variant):

@@ -29,34 +29,72 @@ Backwards, from a gradient of the image to parameters (``nerf``)::
 
 ``nerf_path`` has another backdrop (paths.py), ``nerf_tracking`` another estimate of the integral.
 
-Plugin classes inherit from classes of the active Mitsuba variant, so the modules
-that define them are imported again whenever the variant changes.
+Plugin classes inherit from classes of the active Mitsuba variant, so the modules that define them
+are imported once for each variant. Inside, light is RGB where fields emit it and in the colours of
+the variant everywhere else (colors.py).
 """
 
 from __future__ import annotations
 
 import importlib
 import sys
+from types import ModuleType
+from typing import Any, NoReturn
 
 import mitsuba as mi
 
-_PLUGINS = ("nerfmedium", "nerf", "nerf_path", "nerf_tracking")
-_loaded_for: str | None = None
-_follows_variant = False
+from ..base.errors import InputError
+from ..base.variants import unsuitable
+
+_MEDIA = ("nerfmedium",)
+_INTEGRATORS = ("nerf", "nerf_path", "nerf_tracking")
+
+# The modules of this folder, of every variant that was active, whose classes or functions they
+# hold. Only those of the active one can be imported.
+_modules: dict[str, dict[str, ModuleType]] = {}
+_active: str | None = None
 
 
 def register(*_: object) -> None:
-    """Registers the plugins with the active variant; does nothing for scalar ones."""
-    global _loaded_for
+    """Registers the plugins with the active variant, or such as say why it has none."""
+    global _active
     variant = mi.variant()
-    if variant is None or variant.startswith("scalar") or variant == _loaded_for:
+    if variant is None or variant == _active:
         return
-    # All modules of this folder hold classes or functions of the variant, or import such.
-    for name in [name for name in sys.modules if name.startswith(f"{__name__}.")]:
+    _active = variant
+    for name in _ours():
         del sys.modules[name]
-    for name in _PLUGINS:
-        importlib.import_module(f"{__name__}.{name}")
-    _loaded_for = variant
+        vars(sys.modules[__name__]).pop(name.removeprefix(f"{__name__}."), None)
+    if variant in _modules:
+        for name, module in _modules[variant].items():
+            sys.modules[name] = module
+            setattr(sys.modules[__name__], name.removeprefix(f"{__name__}."), module)
+    elif (why := unsuitable(variant)) is not None:
+        _refuse(variant, why)
+        _modules[variant] = {}
+    else:
+        for name in _MEDIA + _INTEGRATORS:
+            importlib.import_module(f"{__name__}.{name}")
+        _modules[variant] = {name: sys.modules[name] for name in _ours()}
+
+
+def _ours() -> list[str]:
+    return [name for name in sys.modules if name.startswith(f"{__name__}.")]
+
+
+def _refuse(variant: str, why: str) -> None:
+    """Registers plugins that cannot be made."""
+
+    def refuse(props: Any) -> NoReturn:
+        raise InputError(f"{props.plugin_name()}: variant '{variant}' {why}, such as 'llvm_ad_rgb'")
+
+    for name in _MEDIA:
+        mi.register_medium(name, refuse)
+    for name in _INTEGRATORS:
+        mi.register_integrator(name, refuse)
+
+
+_follows_variant = False
 
 
 def register_always() -> None:

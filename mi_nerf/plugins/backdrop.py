@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError
+from .colors import CHANNELS, Spectrum, polarized, unpolarized
 
 # What may be nested, by name of the class (after a change of variant, Mitsuba may hold a class of
 # its own twice). Each returns the radiance along a ray, knows nothing of other rays, and has
@@ -41,7 +42,7 @@ class Hit:
 class Light:
     """What arrives from there, as if no fields were before it."""
 
-    radiance: list[Any]  # R, G, B
+    radiance: list[Any]  # one array for each colour of the variant
     valid: Any  # 1 where there is something opaque, to the film's alpha channel
     states: list[Any] = field(default_factory=list)  # of the nested integrator, path by path
 
@@ -99,10 +100,10 @@ class Environment(Backdrop):
 
     def _radiance(self, ray: Any) -> list[Any]:
         if self._emitter is None:
-            return [mi.Float(0)] * 3
+            return [mi.Float(0)] * CHANNELS
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(ray))
-        si.wi = -ray.d
-        radiance = list(self._emitter.eval(si))
+        si.wi, si.wavelengths = -ray.d, ray.wavelengths
+        radiance = list(unpolarized(self._emitter.eval(si)))
         return [linear_to_srgb(c) for c in radiance] if self._encoded else radiance
 
 
@@ -135,7 +136,7 @@ class Surfaces(Backdrop):
 
     def shade(self, hit: Hit, ray: Any, sampler: Any, opacity: Any) -> Light:
         """What the nested integrator returns for the rays, on average."""
-        total, states, valid = mi.Color3f(0), [], mi.Bool(False)
+        total, states, valid = Spectrum(0), [], mi.Bool(False)
         sampler = sampler.clone()
         for _ in range(self._paths):
             radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler)
@@ -150,7 +151,7 @@ class Surfaces(Backdrop):
     def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
         if not self._differentiable():
             return
-        pull = mi.Color3f(*gradients) * (1 / self._paths)
+        pull = Spectrum(*gradients) * (1 / self._paths)
         sampler = sampler.clone()
         for state in light.states:
             if self._replayed:
@@ -163,7 +164,7 @@ class Surfaces(Backdrop):
             dr.eval()
 
     def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
-        total = dr.zeros(mi.Color3f, dr.width(ray))
+        total = dr.zeros(Spectrum, dr.width(ray))
         if not self._differentiable():
             return list(total)
         if _class_name(self._integrator) == "PRBVolpathIntegrator":
@@ -178,7 +179,7 @@ class Surfaces(Backdrop):
             else:
                 with dr.resume_grad(), _differentiable_loops():
                     radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler)
-                    total += mi.Color3f(*_forward(list(radiance)))
+                    total += Spectrum(*_forward(list(radiance)))
             sampler.schedule_state()
             dr.eval(total)
         return list(total * (1 / self._paths))
@@ -186,7 +187,15 @@ class Surfaces(Backdrop):
     def _differentiable(self) -> bool:
         """Whether any parameter has a gradient: some integrators refuse to work without."""
         with dr.resume_grad():
-            return bool(dr.grad_enabled([value for _, value in mi.traverse(self._scene)]))
+            found = bool(dr.grad_enabled([value for _, value in mi.traverse(self._scene)]))
+        if found and self._replayed and mi.is_polarized:
+            # Measured with Mitsuba 3.9.1: they stop at derivatives of Mueller matrices.
+            name = _REPLAYED[_class_name(self._integrator)]
+            raise InputError(
+                f"nerf: nested integrator '{name}' has no derivatives in polarised variants, "
+                "expected 'path'"
+            )
+        return found
 
     def _sample(
         self, mode: dr.ADMode, ray: Any, sampler: Any, pull: Any = None, state: Any = None
@@ -195,19 +204,19 @@ class Surfaces(Backdrop):
         scene = self._scene
         if not self._replayed:
             radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, True)
-            return radiance, valid, None
+            return unpolarized(radiance), valid, None
         radiance, valid, _, state = self._integrator.sample(
             mode=mode,
             scene=scene,
             sampler=sampler,
             ray=ray,
             depth=mi.UInt32(0),
-            δL=pull,
+            δL=None if pull is None else polarized(pull),
             δaovs=None,
             state_in=state,
             active=mi.Bool(True),
         )
-        return radiance, valid, state
+        return unpolarized(radiance), valid, state
 
 
 def check_nested(integrator: Any) -> None:

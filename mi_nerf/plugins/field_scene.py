@@ -9,6 +9,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .backdrop import Backdrop, Hit, Light
+from .colors import Radiance, Spectrum
 from .film import CameraRays, Channels
 from .integral import Integral, Seen, chunks, see
 from .sampled import Rays, SampledField
@@ -25,16 +26,15 @@ class Traced:
 
     @property
     def outputs(self) -> list[Any]:
-        """What has derivatives: R, G, B, opacity and depth of the fields; R, G, B behind."""
+        """What has derivatives: R, G, B, opacity and depth of the fields; colours behind."""
         return [*self.seen.values, *self.light.radiance]
 
     def channels(self) -> Channels:
         """Fields over what is behind them: color, alpha, depth, opacity, normal, index."""
         *color, opacity, depth = self.seen.values
         hit, light, transmittance = self.hit, self.light, 1 - opacity
-        over = [c + transmittance * b for c, b in zip(color, light.radiance, strict=True)]
         channels: Channels = {
-            "color": mi.Color3f(*over),
+            "color": Radiance(color, transmittance * Spectrum(*light.radiance)),
             "alpha": opacity + transmittance * light.valid,
             "opacity": opacity,
             "depth": depth,

@@ -8,6 +8,7 @@ linear in the values, so that no pass needs to know another one's.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,10 +19,11 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from ..base.errors import InputError
+from .colors import Radiance, polarized, unpolarized
 
 _AXES = (".X", ".Y", ".Z")
 
-Channels = dict[str, Any]  # color, alpha, and what else an integrator knows, ray by ray
+Channels = dict[str, Any]  # color (Radiance), alpha, and what else is known, ray by ray
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,10 @@ class FieldIntegrator(ADIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        if not mi.variant().endswith("_rgb"):
-            raise InputError(
-                f"{self.plugin}: variant '{mi.variant()}' is not supported, "
-                "expected 'llvm_ad_rgb' or 'cuda_ad_rgb'"
-            )
         self.near, self.far = props.get("near", None), props.get("far", None)
+        for name, value in (("near", self.near), ("far", self.far)):
+            if value is not None and math.isnan(value):
+                raise self._unlike(name, value, "a distance")
         # Read by the base class in C++; kept here for the background.
         self.show_background = not bool(props.get("hide_emitters", False))
         self.aovs = self._parse_aovs(str(props.get("aovs", "")))
@@ -137,7 +137,8 @@ class FieldIntegrator(ADIntegrator):
             camera = CameraRays(ray, None, None, random, sampler)
             channels = self._scene(scene).trace(camera).channels()
             active = mi.Bool(active)
-            color = dr.select(active, channels["color"], 0)
+            color = channels["color"].spectrum(ray.wavelengths)
+            color = polarized(dr.select(active, color, 0))
             aovs = [dr.select(active, value, 0) for value in self._aov_values(channels)]
         return color, active & (channels["alpha"] > 0), aovs, None
 
@@ -231,7 +232,7 @@ class FieldIntegrator(ADIntegrator):
         """The film's sums of an image that is black: only the weights of the samples."""
         block, zero = None, mi.Float(0)
         black: Channels = dict.fromkeys(self.known, zero)
-        black |= {"color": mi.Color3f(0), "alpha": zero, "normal": mi.Normal3f(0)}
+        black |= {"color": Radiance([zero] * 3), "alpha": zero, "normal": mi.Normal3f(0)}
         for camera in self._passes(scene, sensor, seed, spp, self.rays_per_adjoint):
             block = self._splat(sensor.film(), block, camera, black)
         return block
@@ -279,16 +280,17 @@ class FieldIntegrator(ADIntegrator):
     ) -> mi.ImageBlock:
         """Adds the rays' values to the film's sums, through its reconstruction filter."""
         block = block or film.create_block()
-        ADIntegrator._splat_to_block(
-            block,
-            film,
-            camera.position,
-            value=channels["color"] * camera.weight,
-            weight=1.0,
-            alpha=channels["alpha"],
-            aovs=self._aov_values(channels),
-            wavelengths=camera.ray.wavelengths,
-        )
+        weight, wavelengths = unpolarized(camera.weight), camera.ray.wavelengths
+        color, alpha = channels["color"], channels["alpha"]
+        if mi.has_flag(film.flags(), mi.FilmFlags.Special):  # it knows what to do with spectra
+            value = color.spectrum(wavelengths) * weight
+            count = block.channel_count()
+            values = film.prepare_sample(value, wavelengths, count, weight=1.0, alpha=alpha)
+        else:
+            values = [*color.on_film(weight, wavelengths)]
+            values += [alpha] if mi.has_flag(film.flags(), mi.FilmFlags.Alpha) else []
+            values += [mi.Float(1), *self._aov_values(channels)]
+        block.put(camera.position, values)
         if evaluate:
             dr.eval(block.tensor())  # lets go of this pass before the next one
         return block

@@ -15,6 +15,7 @@ from ..base.color import srgb_to_linear
 from ..march.merging import integrate_merged, merge
 from ..march.quadrature import integrate
 from ..march.walk import can_walk
+from .colors import emission
 from .crossing import Crossing, crossings
 from .sampled import Rays, SampledField
 
@@ -26,11 +27,12 @@ class Seen:
     values: list[Any]  # R, G, B (linear, premultiplied), opacity, depth in world units
     normal: Any  # of the fields, where wanted, else 0
     index: Any  # of the field that contributes most, from 1; 0 for none
+    wavelengths: Any = None  # of the rays, in spectral variants
 
     @property
     def color(self) -> Any:
-        """Linear radiance."""
-        return mi.Color3f(*self.values[:3])
+        """Radiance in the colours of the variant."""
+        return emission(self.values[:3], self.wavelengths)
 
     @property
     def opacity(self) -> Any:
@@ -58,7 +60,7 @@ def see(fields: list[SampledField], rays: Rays, *, normals: bool = False) -> See
         if normals:
             dr.scatter(normal, mi.Normal3f(*integral.normal), where)
         dr.eval(values, index, normal)
-    return Seen(values, normal, index)
+    return Seen(values, normal, index, rays.wavelengths)
 
 
 def _walked(marched: SampledField, rays: Rays) -> Seen:

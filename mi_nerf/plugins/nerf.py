@@ -8,6 +8,7 @@ import mitsuba as mi
 
 from ..base.errors import InputError
 from .backdrop import Backdrop, Environment, Surfaces, check_nested
+from .colors import check_encoded
 from .field_scene import FieldScene
 from .film import FieldIntegrator
 from .marching import MarchingIntegrator
@@ -169,6 +170,8 @@ class NerfIntegrator(MarchingIntegrator):
                 "nerf: encoded=true with several fields or a nested integrator, expected a "
                 "single field: light mixes in linear radiance"
             )
+        if encoded:
+            check_encoded(self.plugin)
         fields = self._marched(found, encoded)
         normals = self._wants_normals(fields)
         backdrop: Backdrop

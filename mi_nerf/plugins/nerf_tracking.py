@@ -13,8 +13,8 @@ from ..base.errors import InputError
 from ..estimators.majorant import Majorants
 from ..estimators.tracking import track
 from ..march.intervals import ray_segments
-from ..march.quadrature import over_background
 from .backdrop import Environment
+from .colors import Radiance, Spectrum, check_encoded
 from .film import CameraRays, Channels, FieldIntegrator
 from .placement import find_fields
 from .sampled import SampledField
@@ -24,13 +24,12 @@ from .sampled import SampledField
 class Tracked:
     """What camera rays see, by an estimate."""
 
-    color: list[Any]  # in front of the environment
+    color: Radiance  # in front of the environment
     opacity: Any
 
     def channels(self) -> Channels:
         """Colour and opacity."""
-        color = mi.Color3f(*self.color)
-        return {"color": color, "alpha": self.opacity, "opacity": self.opacity}
+        return {"color": self.color, "alpha": self.opacity, "opacity": self.opacity}
 
 
 @dataclass(frozen=True)
@@ -57,8 +56,9 @@ class TrackedScene:
         )
         hit = self.environment.intersect(ray)
         light = self.environment.shade(hit, ray, camera.sampler, seen.opacity)
-        color = over_background(seen.color, seen.opacity, light.radiance)
-        return Tracked(color, seen.opacity)
+        return Tracked(
+            Radiance(seen.color, (1 - seen.opacity) * Spectrum(*light.radiance)), seen.opacity
+        )
 
 
 class NerfTrackingIntegrator(FieldIntegrator):
@@ -164,6 +164,8 @@ class NerfTrackingIntegrator(FieldIntegrator):
                 "nerf_tracking: the field was trained on sRGB images, and decoding what is "
                 "composited in sRGB would be biased, expected encoded=true"
             )
+        if field.color_space == "srgb":
+            check_encoded(self.plugin)
         environment = Environment(scene, self.show_background, field.color_space == "srgb")
         seen = self.majorant is None
         if seen:

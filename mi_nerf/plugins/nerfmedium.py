@@ -151,7 +151,7 @@ class NerfMedium(mi.Medium):
         self.to_world = mi.Transform4f(np.array(matrix, np.float32))
         self._grid: Any = None
         self._contents: FieldFile | None = None  # what the grid belongs to, until weights change
-        self._stale = False
+        self._stale, self._checked = False, False
         self.field: Any
         if "field" in props:
             self._describe_formula(props)
@@ -203,7 +203,32 @@ class NerfMedium(mi.Medium):
 
     def parameters_changed(self, keys: list[str] | None = None) -> None:
         """New weights may fill cells that were empty: the next picture looks at them again."""
-        self._stale |= not keys or any(k in self._names for k in keys)
+        changed = not keys or any(k in self._names for k in keys)
+        self._stale |= changed
+        self._checked &= not changed
+
+    def check_finite(self) -> None:
+        """Refuses weights that would turn the whole picture into NaN.
+
+        Raises:
+            InputError: naming those that are NaN or infinite.
+        """
+        if self._checked:
+            return
+        parameters = self.field.parameters()
+        bad = dr.zeros(mi.UInt32, len(parameters))
+        dr.make_opaque(bad)
+        for i, name in enumerate(self._names.values()):
+            values = dr.detach(parameters[name])
+            values = values.array if dr.is_tensor_v(values) else dr.ravel(values)
+            dr.scatter(bad, mi.UInt32(1), dr.opaque(mi.UInt32, i), ~dr.isfinite(values))
+        wrong = [name for name, b in zip(self._names, np.array(bad), strict=True) if b]
+        if wrong:
+            raise InputError(
+                f"nerfmedium: '{self.id()}': {', '.join(wrong)}: NaN or infinite, "
+                "expected finite numbers"
+            )
+        self._checked = True
 
     # ---- What Mitsuba's own volume integrators find: nothing. Theirs would fail otherwise, ----
     # ---- in any scene, as long as a field exists anywhere.                                 ----

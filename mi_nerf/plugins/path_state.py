@@ -53,6 +53,7 @@ class Paths:
     vertex: Any  # the surface that the segment comes from
     pdf: Any  # of its direction, by the surface's BSDF
     delta: Any  # whether that has no density: emitters and fields cannot be sampled so
+    wavelengths: Any  # in spectral variants
 
     def take(self, index: Any) -> Any:
         """Some of them."""
@@ -82,9 +83,10 @@ class Connections:
         lit = mi.UInt32(dr.compress(dr.max(self.light) > 0))
         reach = self.reach if len(self.reach) == 1 else gather(self.reach, lit)
         o, d, light = (gather(v, lit) for v in (self.ray.o, self.ray.d, self.light))
+        wavelengths = gather(self.ray.wavelengths, lit)
         jitter = None if jitter is None else gather(jitter, lit)
-        dr.eval(o, d, reach, light, jitter)
-        return lit, Rays(o, d, reach, jitter), light
+        dr.eval(o, d, reach, light, jitter, wavelengths)
+        return lit, Rays(o, d, reach, jitter, wavelengths), light
 
 
 @dataclass

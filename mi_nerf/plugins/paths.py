@@ -11,6 +11,7 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import mis_weight
 
 from .backdrop import Backdrop, Hit, Light
+from .colors import Spectrum, unpolarized
 from .field_light import FieldLight
 from .integral import see, transmittance
 from .path_state import Chance, Connections, Ends, Image, Paths, PathSettings, gather
@@ -69,7 +70,7 @@ class PathsBehind(Backdrop):
     def shade(self, hit: PathHit, ray: Any, sampler: Any, opacity: Any) -> Light:
         """The radiance from there on, on average over paths."""
         settings, count = self._settings, dr.width(hit.distance)
-        image = Image(dr.zeros(mi.Color3f, count), dr.zeros(mi.Float, count))
+        image = Image(dr.zeros(Spectrum, count), dr.zeros(mi.Float, count))
         dr.make_opaque(image.radiance, image.alpha)
         sampler = sampler.clone()
         going = dr.compress(1 - opacity > settings.stop) if settings.max_depth else mi.UInt32()
@@ -106,12 +107,13 @@ class PathsBehind(Backdrop):
             slot=slot,
             o=ends.ray.o,
             d=ends.ray.d,
-            throughput=mi.Color3f(one),
+            throughput=Spectrum(one),
             eta=one,
             transmittance=one,
             vertex=ends.ray.o,
             pdf=one,
             delta=dr.full(mi.Bool, True, len(slot)),
+            wavelengths=ends.ray.wavelengths,
         )
         dr.make_opaque(paths, ends)
         for depth in itertools.count():
@@ -125,11 +127,11 @@ class PathsBehind(Backdrop):
 
     def _travel(self, paths: Paths, jitter: Any, image: Image) -> Ends:
         """Follows paths through the fields to the next surface."""
-        ray = mi.Ray3f(paths.o, paths.d)
+        ray = mi.Ray3f(paths.o, paths.d, 0, paths.wavelengths)
         pi = self._scene.ray_intersect_preliminary(ray, coherent=False)
         dr.eval(ray, pi)
         if self._fields:
-            seen = see(self._fields, Rays(paths.o, paths.d, pi.t, jitter))
+            seen = see(self._fields, Rays(paths.o, paths.d, pi.t, jitter, paths.wavelengths))
             weight = mi.Float(1)
             if self._light.boxes:
                 pdf = self._light.pdf(paths.vertex, paths.d)
@@ -178,7 +180,8 @@ class PathsBehind(Backdrop):
         ds = mi.DirectionSample3f(self._scene, si, before)
         pdf = self._scene.pdf_emitter_direction(before, ds, ~paths.delta)
         shown = si.is_valid() | mi.Bool(depth > 0 or not self._settings.hide_lights)
-        return paths.throughput * mis_weight(paths.pdf, pdf) * ds.emitter.eval(si, shown)
+        emitted = unpolarized(ds.emitter.eval(si, shown))
+        return paths.throughput * mis_weight(paths.pdf, pdf) * emitted
 
     def _to_emitters(
         self, si: Any, bsdf: Any, paths: Paths, chance: Chance, active: Any
@@ -187,11 +190,13 @@ class PathsBehind(Backdrop):
         ds, weight = self._scene.sample_emitter_direction(si, chance.emitter, True, active)
         active = active & (ds.pdf != 0)
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
-        weight *= dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-        light = dr.select(active, paths.throughput * value * weight, 0)
+        weight = unpolarized(weight) * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
+        light = dr.select(active, paths.throughput * unpolarized(value) * weight, 0)
         # Of emitters at infinity the scene says a distance, within which not all fields lie.
         infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        return Connections(mi.Ray3f(si.p, ds.d), dr.select(infinite, dr.inf, ds.dist), light)
+        return Connections(
+            mi.Ray3f(si.p, ds.d, 0, si.wavelengths), dr.select(infinite, dr.inf, ds.dist), light
+        )
 
     def _to_fields(
         self, si: Any, bsdf: Any, paths: Paths, chance: Chance, active: Any
@@ -204,7 +209,7 @@ class PathsBehind(Backdrop):
         active = active & (density > 0)
         value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(d), active)
         weight = mis_weight(density, pdf) / dr.select(active, density, 1)
-        light = dr.select(active, paths.throughput * value * weight, 0)
+        light = dr.select(active, paths.throughput * unpolarized(value) * weight, 0)
         return Connections(si.spawn_ray(d), mi.Float(dr.inf), light)
 
     def _turn(
@@ -215,7 +220,7 @@ class PathsBehind(Backdrop):
             mi.BSDFContext(), si, chance.bsdf_component, chance.bsdf, active
         )
         ray = si.spawn_ray(si.to_world(sample.wo))
-        throughput, eta = paths.throughput * weight, paths.eta * sample.eta
+        throughput, eta = paths.throughput * unpolarized(weight), paths.eta * sample.eta
         strongest = dr.max(throughput)
         going = active & (strongest > 0)
         if depth + 1 >= self._settings.rr_depth:
@@ -234,6 +239,7 @@ class PathsBehind(Backdrop):
             vertex=si.p,
             pdf=sample.pdf,
             delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
+            wavelengths=paths.wavelengths,
         )
         return following, going
 

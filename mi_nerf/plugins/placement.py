@@ -100,6 +100,7 @@ def find_fields(scene: mi.Scene, *, least: int = 1) -> list[PlacedField]:
                     f"nerfmedium: the cube '{shape.id()}' is a light source, "
                     "expected one that only holds a field"
                 )
+            medium.check_finite()
             inner = np.array(medium.to_world.matrix, np.float64).reshape(4, 4)
             _check_volume(inner, "the medium's to_world")
             for number, outer in enumerate(cubes_to_world(shape)):
@@ -147,7 +148,9 @@ def cubes_to_world(shape: mi.Shape) -> list[Matrix]:
 
 
 def _check_volume(matrix: Matrix, what: str) -> None:
-    stretch = np.linalg.svd(matrix[:3, :3], compute_uv=False) if np.isfinite(matrix).all() else [0]
+    if not np.isfinite(matrix).all():
+        raise InputError(f"nerfmedium: {what} is NaN or infinite, expected finite numbers")
+    stretch = np.linalg.svd(matrix[:3, :3], compute_uv=False)
     if not stretch[-1] > 1e-6 * stretch[0]:
         raise InputError(f"nerfmedium: {what} is singular, expected a volume")
 

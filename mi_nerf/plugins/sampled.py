@@ -80,11 +80,14 @@ class Rays:
     d: Any  # unit
     reach: Any  # R distances: of a surface, or of the far clip plane
     jitter: Any  # R numbers in [0, 1), or None
+    wavelengths: Any = None  # in spectral variants
 
     def take(self, index: Any) -> Rays:
         """Some of them."""
         o, d = gather_vector3(self.o, index), gather_vector3(self.d, index)
         reach = dr.gather(mi.Float, self.reach, index)
         jitter = None if self.jitter is None else dr.gather(mi.Float, self.jitter, index)
-        dr.eval(o, d, reach, jitter)
-        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter)
+        w = self.wavelengths
+        w = None if w is None else dr.gather(type(w), w, index)
+        dr.eval(o, d, reach, jitter, w)
+        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter, w)

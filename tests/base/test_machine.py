@@ -31,6 +31,12 @@ def test_without_limits_it_is_all_there_is(tmp_path: Path) -> None:
     assert available_memory(system(tmp_path, "0::/a\n", **limits)) == THERE
 
 
+def test_a_system_that_does_not_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As Windows: less is assumed than most machines have."""
+    monkeypatch.delattr(os, "sysconf")
+    assert available_memory(tmp_path) == 8 << 30
+
+
 @pytest.mark.parametrize("limited", ["memory_max", "a__memory_max", "a__b__memory_max"])
 def test_the_least_limit_of_the_groups_above_counts(tmp_path: Path, limited: str) -> None:
     """Version 2: a group of its own, one around it, or that of a container."""

@@ -6,10 +6,17 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import mitsuba as mi
+import numpy as np
 import pytest
 
 import mi_nerf
-from mi_nerf.base.variants import choose_variant, using_variant
+from mi_nerf.base.variants import (
+    active_variant,
+    available_variants,
+    choose_variant,
+    unsuitable,
+    using_variant,
+)
 from mi_nerf.tasks import render as rendering
 
 OURS = choose_variant()
@@ -137,3 +144,76 @@ def test_an_interruption_between_two_frames(
     with pytest.raises(KeyboardInterrupt):
         mi_nerf.render(scene, size=(4, 4), spp=1)
     assert mi.variant() == callers
+
+
+# ---- Which are accepted ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "why"),
+    [
+        ("llvm_ad_rgb", None),
+        ("llvm_ad_mono_polarized", None),
+        ("cuda_ad_spectral", None),
+        ("metal_ad_rgb", None),
+        ("scalar_rgb", "has no derivatives"),
+        ("llvm_rgb", "has no derivatives"),
+        ("cuda_spectral_polarized", "has no derivatives"),
+        ("llvm_ad_rgb_double", "double precision"),
+        ("scalar_spectral_double", "double precision"),
+    ],
+)
+def test_what_has_derivatives_in_single_precision_is_accepted(name: str, why: str | None) -> None:
+    found = unsuitable(name)
+    assert found is None if why is None else why in str(found)
+
+
+def test_rgb_comes_first_and_what_has_been_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed = ["scalar_rgb", "metal_ad_rgb", "metal_ad_mono", "llvm_ad_rgb_double"]
+    installed += ["llvm_ad_mono", "llvm_ad_rgb", "cuda_ad_mono", "cuda_ad_rgb", "new_ad_rgb"]
+    monkeypatch.setattr(mi, "variants", lambda: installed)
+    there = {"Metal", "LLVM"}
+    monkeypatch.setattr("drjit.has_backend", lambda backend: backend.name in there)
+    expected = ["llvm_ad_rgb", "metal_ad_rgb", "llvm_ad_mono", "metal_ad_mono"]
+    assert available_variants() == expected
+    there |= {"CUDA"}
+    assert available_variants()[:3] == ["cuda_ad_rgb", "llvm_ad_rgb", "metal_ad_rgb"]
+    there -= {"CUDA", "LLVM"}
+    assert choose_variant() == "metal_ad_rgb"
+    assert choose_variant("metal_ad_mono") == "metal_ad_mono"
+    there.clear()
+    with pytest.raises(mi_nerf.InputError, match="no usable backend"):
+        choose_variant()
+
+
+@pytest.mark.parametrize("name", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_functions_keep_the_active_variant_whatever_its_colors(
+    callers: str, name: str, scene: Path, tmp_path: Path
+) -> None:
+    """Pictures of a scene are those of the variant; a dataset needs colours."""
+    with using_variant(name):
+        assert active_variant() == name
+        image = next(iter(mi_nerf.render(scene, size=(4, 4), spp=64, show=False)))
+        assert image.shape == (4, 4, 4) and np.isfinite(image).all()
+        assert mi.variant() == name
+        if name.endswith("mono"):
+            assert (image[..., 0] == image[..., 1]).all()
+            with pytest.raises(mi_nerf.InputError, match="'llvm_ad_mono': knows no colours"):
+                mi_nerf.generate(scene, tmp_path / "made", show=False)
+            assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_training_and_measuring_are_the_same_in_any_colors(
+    callers: str, name: str, blob: Path, tmp_path: Path
+) -> None:
+    """They know nothing of Mitsuba's colours: Dr.Jit's arrays are those of the backend."""
+    found = {}
+    for variant in ("llvm_ad_rgb", name):
+        with using_variant(variant):
+            run = mi_nerf.start(blob, tmp_path / variant, steps=5, settings={"network.width": 16})
+            run.train()
+            assert run.variant == variant == mi.variant()
+            found[variant] = mi_nerf.evaluate(run, views=1)["mean"]["psnr"]
+    assert found[name] == pytest.approx(found["llvm_ad_rgb"], abs=1e-3)

@@ -138,7 +138,7 @@ LONG = "/a/very/long/path/that/fits/in/no/line/of/a/terminal/of/eighty/columns/a
         ("train {data} --out {out} --seed -1", "--seed -1: expected a number from 0 to"),
         ("train {data} --out {out} --seed 2147483648", "--seed 2147483648: expected a number"),
         ("train {data} --out {out} --preset new", "preset 'new': unknown, expected one of nerf"),
-        ("train {data} --out {out} --variant scalar_rgb", "'scalar_rgb': expected one of cuda_ad"),
+        ("train {data} --out {out} --variant scalar_rgb", "'scalar_rgb': has no derivatives, ex"),
         ("eval {run} --views 0", "--views 0: expected at least 1"),
         ("eval {run} --views -2", "--views -2: expected at least 1"),
         ("eval {run} --downscale 0", "--downscale 0: expected at least 1"),
@@ -232,7 +232,7 @@ def test_variant_of_another_machine(
 ) -> None:
     monkeypatch.setattr(backend, "available_variants", lambda: ["llvm_ad_rgb"])
     message = refused("eval", blob_run, "--variant", "cuda_ad_rgb")
-    assert "'cuda_ad_rgb': does not work on this machine, expected llvm_ad_rgb" in message
+    assert "'cuda_ad_rgb': does not work on this machine, expected one such as 'llvm_ad" in message
 
 
 def test_info_works_without_a_backend(
