@@ -40,7 +40,7 @@ import sys
 
 import mitsuba as mi
 
-_PLUGINS = ("nerfmedium", "nerf", "nerf_path", "nerf_tracking")
+_PLUGINS = ("nerfmedium", "nerfviews", "nerf", "nerf_path", "nerf_tracking")
 _loaded_for: str | None = None
 _follows_variant = False
 

@@ -9,7 +9,7 @@ linear in the values, so that no pass needs to know another one's.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -49,8 +49,12 @@ class Traced(Protocol):
 class TracedScene(Protocol):
     """A scene as it is now, to be seen along camera rays."""
 
-    def trace(self, camera: CameraRays) -> Any:
-        """What the rays find, a :class:`Traced`; without derivatives."""
+    def trace(self, camera: CameraRays, *, keep: bool = False) -> Any:
+        """What the rays find, a :class:`Traced`; without derivatives.
+
+        Args:
+            keep: what :meth:`backward` will need, as far as it is small.
+        """
 
     def backward(self, traced: Any, gradients: list[Any]) -> None:
         """Carries gradients of the ``outputs`` to the parameters of the scene."""
@@ -163,14 +167,15 @@ class FieldIntegrator(ADIntegrator):
         film, limit = sensor.film(), self.rays_per_adjoint
         with dr.suspend_grad():
             view: TracedScene = self._scene(scene)
-            sums = self._weights(scene, sensor, seed, spp)
+            cameras = _Kept(lambda: self._passes(scene, sensor, seed, spp, limit))
+            sums = self._weights(film, cameras)
             with dr.resume_grad():
                 dr.enable_grad(sums.tensor())
                 film.put_block(sums)
                 _pull(film.develop(), grad_in)
                 adjoint = dr.grad(sums.tensor())
-            for camera in self._passes(scene, sensor, seed, spp, limit):
-                traced: Traced = view.trace(camera)
+            for camera in cameras:
+                traced: Traced = view.trace(camera, keep=True)
                 outputs = traced.outputs
                 with dr.resume_grad():
                     dr.enable_grad(outputs)
@@ -196,9 +201,10 @@ class FieldIntegrator(ADIntegrator):
         film, limit = sensor.film(), self.rays_per_adjoint
         with dr.suspend_grad():
             view: TracedScene = self._scene(scene)
-            sums = self._weights(scene, sensor, seed, spp)
+            cameras = _Kept(lambda: self._passes(scene, sensor, seed, spp, limit))
+            sums = self._weights(film, cameras)
             tangent = dr.zeros(mi.TensorXf, sums.tensor().shape)
-            for camera in self._passes(scene, sensor, seed, spp, limit):
+            for camera in cameras:
                 traced: Traced = view.trace(camera)
                 outputs, slopes = traced.outputs, view.forward(traced)
                 with dr.resume_grad():
@@ -227,13 +233,13 @@ class FieldIntegrator(ADIntegrator):
                 f"{self.plugin}: has no derivatives, expected the integrator 'nerf' for them"
             )
 
-    def _weights(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> mi.ImageBlock:
+    def _weights(self, film: mi.Film, cameras: Iterable[CameraRays]) -> mi.ImageBlock:
         """The film's sums of an image that is black: only the weights of the samples."""
         block, zero = None, mi.Float(0)
         black: Channels = dict.fromkeys(self.known, zero)
         black |= {"color": mi.Color3f(0), "alpha": zero, "normal": mi.Normal3f(0)}
-        for camera in self._passes(scene, sensor, seed, spp, self.rays_per_adjoint):
-            block = self._splat(sensor.film(), block, camera, black)
+        for camera in cameras:
+            block = self._splat(film, block, camera, black)
         return block
 
     # ---------------------------------- Camera rays ----------------------------------
@@ -311,6 +317,23 @@ class FieldIntegrator(ADIntegrator):
             if item:
                 aovs.append((name or kind, kind))
         return aovs
+
+
+class _Kept:
+    """Camera rays that are gone through several times: made once if they are one pass."""
+
+    def __init__(self, passes: Callable[[], Iterator[CameraRays]]) -> None:
+        self._passes = passes
+        self._only: CameraRays | None = None
+
+    def __iter__(self) -> Iterator[CameraRays]:
+        if self._only is not None:
+            yield self._only
+            return
+        number, camera = 0, None
+        for number, camera in enumerate(self._passes(), 1):
+            yield camera
+        self._only = camera if number == 1 else None
 
 
 def _pull(value: Any, gradient: Any) -> None:
