@@ -71,7 +71,7 @@ class Crossing:
                 block,
                 keep=keep,
                 stop=whole.settings.stop,
-                tail=-(-block // 4) if exact else None,
+                tail=-(-block // 2) if exact else None,
                 fuse=not exact,
                 emission=emission,
             )

@@ -78,6 +78,11 @@ class FieldScene:
         light = self._backdrop.shade(hit, camera.ray, camera.sampler, seen.opacity)
         return Traced(camera, hit, seen, light, kept)
 
+    @property
+    def trained(self) -> bool:
+        """Whether all fields are being trained."""
+        return all(marched.trained for marched in self._fields)
+
     def _keep(self, rays: Rays) -> tuple[Any, Integral] | None:
         """The integral along the rays that cross fields; ``None`` if they are several chunks."""
         if not self._differentiable():

@@ -42,6 +42,10 @@ class Traced(Protocol):
     def outputs(self) -> list[Any]:
         """The arrays of which the channels are made, where derivatives can be had."""
 
+    @property
+    def camera(self) -> CameraRays:
+        """The rays themselves."""
+
     def channels(self) -> Channels:
         """What the rays show."""
 
@@ -83,6 +87,7 @@ class FieldIntegrator(ADIntegrator):
         # Read by the base class in C++; kept here for the background.
         self.show_background = not bool(props.get("hide_emitters", False))
         self.aovs = self._parse_aovs(str(props.get("aovs", "")))
+        self._shown: _Shown | None = None
 
     def aov_names(self) -> list[str]:
         """Names of the extra channels."""
@@ -102,6 +107,10 @@ class FieldIntegrator(ADIntegrator):
     def _scene(self, scene: mi.Scene) -> Any:
         """The scene as it is now: a :class:`TracedScene`, without derivatives only ``trace``."""
 
+    def _trains(self, view: Any, sensor: mi.Sensor, spp: int) -> bool:
+        """Whether the picture is a step of training, whose derivatives take the same samples."""
+        return False
+
     # ---------------------------------- Rendering ----------------------------------
 
     def render(
@@ -118,8 +127,11 @@ class FieldIntegrator(ADIntegrator):
         film, block = sensor.film(), None
         with dr.suspend_grad():
             view = self._scene(scene)
+            keep = self._trains(view, sensor, spp)
             for camera in self._passes(scene, sensor, seed, spp, self.rays_per_pass):
-                block = self._splat(film, block, camera, view.trace(camera).channels())
+                traced = view.trace(camera, keep=True) if keep else view.trace(camera)
+                block = self._splat(film, block, camera, traced.channels())
+            self._shown = _Shown(scene, sensor, _seed_grad(seed), spp, view, traced) if keep else None
             film.put_block(block)
             image = film.develop() if develop else None
             if evaluate and develop:
@@ -166,8 +178,14 @@ class FieldIntegrator(ADIntegrator):
         sensor = self._sensor(scene, sensor)
         film, limit = sensor.film(), self.rays_per_adjoint
         with dr.suspend_grad():
-            view: TracedScene = self._scene(scene)
-            cameras = _Kept(lambda: self._passes(scene, sensor, seed, spp, limit))
+            shown, self._shown = self._shown, None
+            if shown is not None and shown.is_of(scene, sensor, seed, spp):
+                view: TracedScene = shown.view
+                cameras: Iterable[CameraRays] = [shown.traced.camera]
+                film.prepare(self.aov_names())
+            else:
+                shown, view = None, self._scene(scene)
+                cameras = _Kept(lambda: self._passes(scene, sensor, seed, spp, limit))
             sums = self._weights(film, cameras)
             with dr.resume_grad():
                 dr.enable_grad(sums.tensor())
@@ -175,7 +193,7 @@ class FieldIntegrator(ADIntegrator):
                 _pull(film.develop(), grad_in)
                 adjoint = dr.grad(sums.tensor())
             for camera in cameras:
-                traced: Traced = view.trace(camera, keep=True)
+                traced: Traced = shown.traced if shown else view.trace(camera, keep=True)
                 outputs = traced.outputs
                 with dr.resume_grad():
                     dr.enable_grad(outputs)
@@ -317,6 +335,28 @@ class FieldIntegrator(ADIntegrator):
             if item:
                 aovs.append((name or kind, kind))
         return aovs
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What the last picture was made of, if its derivatives shall be those of the same samples."""
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    seed_grad: Any
+    spp: int
+    view: TracedScene
+    traced: Any
+
+    def is_of(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> bool:
+        """Whether a derivative is that of this picture, with the seed that Mitsuba gives it."""
+        same = self.scene is scene and self.sensor is sensor and self.spp == spp
+        return same and isinstance(seed, int) and seed == self.seed_grad
+
+
+def _seed_grad(seed: Any) -> Any:
+    """The seed of the derivatives of a picture, as ``mi.render`` has it by default."""
+    return mi.sample_tea_32(seed, 1)[0] if isinstance(seed, int) else None
 
 
 class _Kept:

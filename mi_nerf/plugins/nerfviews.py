@@ -34,7 +34,7 @@ class NerfViews(mi.Sensor):
 
     All N cameras of a dataset as one sensor, whose film holds their W×H images one below the
     other, W×(N·H) pixels. Rays are made from a table of camera matrices: a kernel is as small
-    for a hundred views as for one, and :monosp:`mi.ad.RayDataLoader`, which otherwise traces
+    for a hundred views as for one, and :monosp:`mi.ad.loaders.RayDataLoader`, which otherwise traces
     every sensor in every step, takes them as a single one. In Python, ``images()`` holds what
     such a film should show: premultiplied, in the dataset's colour space.
 
