@@ -148,6 +148,7 @@ class FieldIntegrator(ADIntegrator):
         **kwargs: Any,
     ) -> tuple[Any, Any, list[Any], Any]:
         """Radiance along single rays, for integrators that nest this one; 0 if not active."""
+        self._require_thawed()
         with dr.suspend_grad():
             random = self._draw(sampler, dr.width(ray), 0)
             camera = CameraRays(ray, None, None, random, sampler)
@@ -251,6 +252,15 @@ class FieldIntegrator(ADIntegrator):
                 f"{self.plugin}: has no derivatives, expected the integrator 'nerf' for them"
             )
 
+    def _require_thawed(self) -> None:
+        """Refuses to be recorded: Dr.Jit cannot pack a network's weights there, either."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise InputError(
+                f"{self.plugin}: inside dr.freeze a picture would be repeated with the numbers of "
+                "samples and the places of fields that it has read once, expected mi.render "
+                "outside of the frozen function"
+            )
+
     def _weights(self, film: mi.Film, cameras: Iterable[CameraRays]) -> mi.ImageBlock:
         """The film's sums of an image that is black: only the weights of the samples."""
         block, zero = None, mi.Float(0)
@@ -277,6 +287,7 @@ class FieldIntegrator(ADIntegrator):
         self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int, limit: int
     ) -> Iterator[CameraRays]:
         """Camera rays, in passes of at most ``limit`` or one a pixel, with seeds of their own."""
+        self._require_thawed()
         film = sensor.film()
         spp = spp or sensor.sampler().sample_count()
         pixels = int(dr.prod(film.crop_size()))

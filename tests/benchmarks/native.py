@@ -77,13 +77,12 @@ scene = mi.load_dict({
     },
 })
 views, medium = scene.sensors()[0], scene.shapes()[0].interior_medium()
-loader = mi.ad.loaders.RayDataLoader(views, views.images(), a["pixels"], seed=a["seed"],
-    regular_reshuffle=True, tile_size=1 << 20)
+images = views.images()
 params = mi.traverse(scene)
 params.keep("box.interior_medium.(?!to_world)")
 optimizer = mi.ad.Adam(lr=1e-2, beta_2=0.99, epsilon=1e-15, mask_updates=True, params=params)
 
-curve, step = [], 0
+curve, step, begins, loader = [], 0, list(a["begins"]), None
 
 def look():
     global clock
@@ -100,12 +99,17 @@ while (seconds := time.perf_counter() - clock) < a["seconds"]:
     if a["looks"] and seconds >= a["looks"][0]:
         a["looks"].pop(0)
         look()
+    if begins and step >= begins[0][0]:
+        loader = mi.ad.loaders.RayDataLoader(views, images, begins.pop(0)[1], seed=a["seed"],
+            regular_reshuffle=True, tile_size=1 << 20)
     rate = 1e-2 * min(1, (step + 1) / 100) * 0.1 ** (seconds / a["seconds"])
     optimizer.set_learning_rate(rate)
     params.update(optimizer)
     target, sensor = loader.next()
     image = mi.render(scene, params, sensor=sensor, seed=step)
-    loss = dr.mean(dr.square(image - target), axis=None)
+    color, alpha = (image - target)[..., :3], (image - target)[..., 3:]
+    # The mean square over backgrounds of any grey, of premultiplied images.
+    loss = dr.mean(color * (color - alpha) + dr.square(alpha) / 3, axis=None)
     dr.backward(loss)
     optimizer.step()
     dr.sync_thread()
@@ -114,6 +118,10 @@ seen = look()
 answer({"package": mi_nerf.__file__, "curve": curve, "steps": step,
     "size": seen["size"], "views": seen["views"]})
 """
+
+# Pixels in a batch of the loop, from which step on: their samples about fill a block of the
+# network, and become fewer on every ray as space turns out to be empty.
+_BEGINS = ((0, 1024), (400, 2048), (1000, 4096))
 
 # What the figures depend on.
 _PARTS = ("cameras", "data", "fields", "march", "plugins", "training")
@@ -130,7 +138,6 @@ def main() -> None:
     parser.add_argument("--preset", default="fast")
     parser.add_argument("--seconds", type=float, default=60.0, help="of the trainer")
     parser.add_argument("--share", type=float, default=1.5, help="of these, for the loop")
-    parser.add_argument("--pixels", type=int, default=4096, help="in a batch of the loop")
     parser.add_argument("--seeds", type=int, default=1, help="how many")
     parser.add_argument("--views", type=int, default=8, help="of the split, evenly spread")
     parser.add_argument("--looks", type=int, default=6, help="on the way")
@@ -183,7 +190,7 @@ def _pair(seed: int, options: argparse.Namespace) -> tuple[dict[str, Any], dict[
                 variant=options.variant,
                 split=options.split,
                 views=options.views,
-                pixels=options.pixels,
+                begins=_BEGINS,
                 looks=[float(s) for s in looks],
             )
         curve = ", ".join(f"{s:.1f} s {p:.2f} dB" for s, p in run["curve"])
