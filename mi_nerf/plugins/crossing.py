@@ -17,7 +17,6 @@ from ..march.placing import place_samples
 from ..march.query import Evaluation
 from .sampled import Rays, SampledField
 
-
 # Queries whose activations are kept from a field's answers to their adjoint, some hundred
 # megabytes of a wide network; more than these are asked a second time, block by block.
 _KEPT = 1 << 16

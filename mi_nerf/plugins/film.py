@@ -123,15 +123,17 @@ class FieldIntegrator(ADIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """Renders an image; see ``mi.render``."""
+        self._require_thawed()
         sensor = self._sensor(scene, sensor)
         film, block = sensor.film(), None
         with dr.suspend_grad():
             view = self._scene(scene)
-            keep = self._trains(view, sensor, spp)
+            self._shown, trains = None, self._trains(view, sensor, spp)
             for camera in self._passes(scene, sensor, seed, spp, self.rays_per_pass):
-                traced = view.trace(camera, keep=True) if keep else view.trace(camera)
+                traced = view.trace(camera, keep=True) if trains else view.trace(camera)
                 block = self._splat(film, block, camera, traced.channels())
-            self._shown = _Shown(scene, sensor, _seed_grad(seed), spp, view, traced) if keep else None
+                if trains:  # all rays are one pass
+                    self._shown = _Shown(scene, sensor, _seed_grad(seed), spp, view, traced)
             film.put_block(block)
             image = film.develop() if develop else None
             if evaluate and develop:
@@ -247,6 +249,7 @@ class FieldIntegrator(ADIntegrator):
         return InputError(f"{self.plugin}: {name}={value}, expected {expected}")
 
     def _require_derivatives(self) -> None:
+        self._require_thawed()
         if not self.differentiable:
             raise InputError(
                 f"{self.plugin}: has no derivatives, expected the integrator 'nerf' for them"
@@ -287,7 +290,6 @@ class FieldIntegrator(ADIntegrator):
         self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int, limit: int
     ) -> Iterator[CameraRays]:
         """Camera rays, in passes of at most ``limit`` or one a pixel, with seeds of their own."""
-        self._require_thawed()
         film = sensor.film()
         spp = spp or sensor.sampler().sample_count()
         pixels = int(dr.prod(film.crop_size()))
@@ -381,10 +383,13 @@ class _Kept:
         if self._only is not None:
             yield self._only
             return
-        number, camera = 0, None
-        for number, camera in enumerate(self._passes(), 1):
+        passes = self._passes()
+        first = next(passes)
+        yield first
+        self._only = first
+        for camera in passes:
+            self._only = None
             yield camera
-        self._only = camera if number == 1 else None
 
 
 def _pull(value: Any, gradient: Any) -> None:

@@ -18,7 +18,6 @@ from ..march.walk import can_walk
 from .crossing import Crossing, crossings
 from .sampled import Rays, SampledField
 
-
 # Samples up to which rays are marched together, whether or not they cross a field: to find
 # out takes as long.
 _FEW = 1 << 18

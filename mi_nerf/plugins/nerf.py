@@ -15,7 +15,6 @@ from .marching import MarchingIntegrator
 from .placement import find_fields
 from .solid_scene import SolidScene, has_surfaces
 
-
 # Camera rays up to which a picture of fields in training keeps what its derivatives need.
 _BATCH = 1 << 14
 
