@@ -1,6 +1,7 @@
 """The Mitsuba plugins of radiance fields, and the way of a camera ray through them.
 
-Integrators ``nerf``, ``nerf_path`` and ``nerf_tracking``, and the medium ``nerfmedium``.
+Integrators ``nerf``, ``nerf_path`` and ``nerf_tracking``, the medium ``nerfmedium``, and the sensor
+``nerfviews`` for all views of a dataset.
 
 Forwards, from a pixel to the film (``nerf``; what is called stands below what calls it)::
 

@@ -19,7 +19,7 @@ from .sampled import Rays, SampledField
 
 # Queries whose activations are kept from a field's answers to their adjoint, some hundred
 # megabytes of a wide network; more than these are asked a second time, block by block.
-_KEPT = 1 << 16
+_KEPT = 1 << 15
 
 
 class Crossing:

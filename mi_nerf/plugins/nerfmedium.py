@@ -41,10 +41,13 @@ class NerfMedium(mi.Medium):
          cells: the field is looked at again before the next picture. (Default: true)
      * - training
        - |bool|
-       - The weights are trained from the start, step by step: cells that the file marks as empty
-         stay so for good, and some of the others are looked at again every 16 changes of the
-         weights, as ``mi-nerf train`` does. (Default: false, all cells are looked at after every
-         change)
+       - The weights are trained from the start, step by step, as ``mi-nerf train`` does. Cells
+         that the file marks as empty stay so for good, and some of the others are looked at
+         again every 16 changes of the weights. Pictures of up to 16384 rays, while weights have
+         gradients, and their derivatives take the same samples, without those behind an
+         optical depth of 10 of what was always seen dense: derivatives are those of the very
+         picture, its noise included, instead of having a seed of their own. (Default: false, all
+         cells are looked at after every change)
      * - to_world
        - |transform|
        - Moves the field within the cube's coordinate system: applied before the cube's own

@@ -47,6 +47,7 @@ PLAN: tuple[tuple[float, str, bool], ...] = (
     (3, "tests.benchmarks.composite", False),
     (4, "tests.benchmarks.generate", False),
     (4, "tests.benchmarks.inverse_loop", False),
+    (4, "tests.benchmarks.native", False),
     (6, "tests.benchmarks.unbiased --paths 10", False),
     (15, "tests.benchmarks.robustness --out runs/robustness --set collapse_check=150", False),
     (140, "tests.benchmarks.resolution --seconds 3600", True),
