@@ -10,7 +10,7 @@ import mitsuba as mi
 
 from .backdrop import Backdrop, Hit, Light
 from .film import CameraRays, Channels
-from .integral import Integral, Seen, chunks, scattered, see
+from .integral import Integral, Seen, chunks, few, scattered, see
 from .sampled import Rays, SampledField
 
 
@@ -84,17 +84,11 @@ class FieldScene:
         return all(marched.trained for marched in self._fields)
 
     def _keep(self, rays: Rays) -> tuple[Any, Integral] | None:
-        """The integral along the rays that cross fields; ``None`` if they are several chunks."""
-        if not self._differentiable():
+        """The integral along few rays, and their numbers; ``None`` of many."""
+        if not (self._differentiable() and few(self._fields, rays)):
             return None
-        found = None
-        for part in chunks(self._fields, rays):
-            if found is not None:
-                return None
-            found = part
-        if found is None:
-            return None
-        return found[0], Integral(self._fields, found[1], dr.ADMode.Backward)
+        index, rays = next(iter(chunks(self._fields, rays)))
+        return index, Integral(self._fields, rays, dr.ADMode.Backward)
 
     def _differentiable(self) -> bool:
         return any(marched.differentiable for marched in self._fields)

@@ -384,9 +384,8 @@ class _Kept:
             yield self._only
             return
         passes = self._passes()
-        first = next(passes)
-        yield first
-        self._only = first
+        self._only = next(passes)
+        yield self._only
         for camera in passes:
             self._only = None
             yield camera

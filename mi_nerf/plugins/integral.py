@@ -209,18 +209,22 @@ class Integral:
         self.normal = [n * inverse for n in sums]
 
 
+def few(fields: list[SampledField], rays: Rays) -> bool:
+    """Whether rays have so few samples that they are marched together."""
+    most = sum(marched.march.samples + marched.march.fine for marched in fields)
+    return len(rays.o[0]) * most <= _FEW
+
+
 def chunks(
     fields: list[SampledField], rays: Rays, *, whole: bool = False
 ) -> Iterator[tuple[Any, Rays]]:
     """The rays that cross any field, with their numbers: in parts of bounded memory, or whole."""
-    count = len(rays.o[0])
-    most = sum(marched.march.samples + marched.march.fine for marched in fields)
-    if count * most <= _FEW and not whole:
-        index = dr.arange(mi.UInt32, count)
+    if few(fields, rays) and not whole:
+        index = dr.arange(mi.UInt32, len(rays.o[0]))
         dr.eval(index, rays)
         yield index, rays
         return
-    samples = dr.zeros(mi.UInt32, count)  # of all fields along each ray
+    samples = dr.zeros(mi.UInt32, len(rays.o[0]))  # of all fields along each ray
     for marched in fields:
         count = dr.opaque(mi.UInt32, marched.march.samples + marched.march.fine)
         samples += dr.select(marched.hit(rays), count, 0)
