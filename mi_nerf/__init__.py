@@ -31,7 +31,7 @@ from .formats.field_file import FieldFile, load_field, save_field  # noqa: E402
 from .plugins import register_always  # noqa: E402
 
 if TYPE_CHECKING:
-    from .api import generate, pictures, render, start
+    from .api import fresh_field, generate, pictures, render, start
     from .base.variants import available_variants, choose_variant
     from .data import Dataset, load_dataset
     from .images.metrics import psnr, ssim
@@ -58,7 +58,7 @@ _LATER = {
     "tasks.target": ("Target", "open_target"),
     "training.config": ("TrainConfig", "setting_names"),
     "training.run": ("Run", "TrainingError"),
-    "api": ("generate", "pictures", "render", "start"),
+    "api": ("fresh_field", "generate", "pictures", "render", "start"),
 }
 
 __all__ = [
@@ -77,6 +77,7 @@ __all__ = [
     "describe",
     "evaluate",
     "find_scene",
+    "fresh_field",
     "generate",
     "load_dataset",
     "load_field",

@@ -16,8 +16,10 @@ from .base.arrays import Image
 from .base.checks import positive, valid_seed
 from .base.errors import InputError, Option
 from .base.progress_bar import progress_bar
-from .base.variants import active_variant
+from .base.variants import active_variant, array_module
 from .data import Dataset
+from .formats.field_file import FieldFile
+from .training import fresh
 from .training import run as training
 from .training.config import TrainConfig, with_settings
 from .training.forecast import PUBLISHED_STEPS
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from .tasks.target import Target
 
 # Training begins sooner without what only the other functions need: they import it themselves.
-__all__ = ["generate", "pictures", "render", "start"]
+__all__ = ["fresh_field", "generate", "pictures", "render", "start"]
 
 Settings = Mapping[str, Any] | Sequence[str]
 
@@ -165,6 +167,32 @@ def start(
         started=started,
         given={assignment.partition("=")[0] for assignment in assignments},
     )
+
+
+def fresh_field(
+    dataset: Dataset,
+    *,
+    preset: str = "nerf",
+    seed: int = 0,
+    settings: Settings = (),
+    variant: str | None = None,
+) -> FieldFile:
+    """The field with which a run on these views would begin, for a training loop of your own.
+
+    Its box and sizes follow from the images, its weights from the seed, and its empty cells
+    from the silhouettes, where images have alpha. :func:`mi_nerf.save_field` writes it to a
+    file, which a medium ``nerfmedium`` with ``training`` loads.
+
+    Args:
+        dataset: training views, from :func:`mi_nerf.load_dataset`.
+        preset, settings: as for :func:`start`.
+
+    Raises:
+        InputError: if the preset or a setting is unknown or out of range.
+    """
+    config = replace(preset_config(preset), seed=valid_seed(seed))
+    config = with_settings(config, _assignments(settings))
+    return fresh.fresh_field(config, dataset, array_module(active_variant(variant)))
 
 
 def render(

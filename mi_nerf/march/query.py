@@ -47,6 +47,7 @@ class Evaluation:
         keep: bool = False,
         stop: float = 0.0,
         tail: int | None = None,
+        fuse: bool = True,
         emission: bool = True,
     ) -> None:
         """Evaluates the field; with ``keep``, activations stay for :meth:`backward`.
@@ -56,11 +57,13 @@ class Evaluation:
             emission: whether it is wanted; a network is asked for its density alone else.
             tail: of the last blocks, to waste less on filling them up. Default: a quarter
                 of large blocks in rounds, else the same.
+            fuse: whether a narrow network may be asked within a kernel where nothing is kept;
+                else as in training.
         """
         self._field, self._samples, self._block = field, samples, block
         self._graph: list[tuple[Any, Any, list[Any]]] = []
         self._tail = tail or (block // 4 if stop > 0 and block >= 4096 else block)
-        self._fused = None if keep else field.fused(emission)
+        self._fused = field.fused(emission) if fuse and not keep else None
         self._emits = emission
         float_type = type(samples.t)
         self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4 if emission else 1)]

@@ -1,6 +1,7 @@
 """The Mitsuba plugins of radiance fields, and the way of a camera ray through them.
 
-Integrators ``nerf``, ``nerf_path`` and ``nerf_tracking``, and the medium ``nerfmedium``.
+Integrators ``nerf``, ``nerf_path`` and ``nerf_tracking``, the medium ``nerfmedium``, and the sensor
+``nerfviews`` for all views of a dataset.
 
 Forwards, from a pixel to the film (``nerf``; what is called stands below what calls it)::
 
@@ -47,6 +48,7 @@ from ..base.errors import InputError
 from ..base.variants import unsuitable
 
 _MEDIA = ("nerfmedium",)
+_SENSORS = ("nerfviews",)
 _INTEGRATORS = ("nerf", "nerf_path", "nerf_tracking")
 
 # The modules of this folder, of every variant that was active, whose classes or functions they
@@ -73,7 +75,7 @@ def register(*_: object) -> None:
         _refuse(variant, why)
         _modules[variant] = {}
     else:
-        for name in _MEDIA + _INTEGRATORS:
+        for name in _MEDIA + _SENSORS + _INTEGRATORS:
             importlib.import_module(f"{__name__}.{name}")
         _modules[variant] = {name: sys.modules[name] for name in _ours()}
 
@@ -90,6 +92,8 @@ def _refuse(variant: str, why: str) -> None:
 
     for name in _MEDIA:
         mi.register_medium(name, refuse)
+    for name in _SENSORS:
+        mi.register_sensor(name, refuse)
     for name in _INTEGRATORS:
         mi.register_integrator(name, refuse)
 

@@ -17,6 +17,10 @@ from ..march.placing import place_samples
 from ..march.query import Evaluation
 from .sampled import Rays, SampledField
 
+# Queries whose activations are kept from a field's answers to their adjoint, some hundred
+# megabytes of a wide network; more than these are asked a second time, block by block.
+_KEPT = 1 << 15
+
 
 class Crossing:
     """The samples of one field on the rays that cross its box, and what it answers."""
@@ -44,8 +48,10 @@ class Crossing:
             o, d, self.scale = self._placed.to_local(rays.o, rays.d, moving=moving)
             dr.eval(o, d, self.scale)
             bounds = marched.bounds(rays.reach, self.scale)
+            exact = mode != dr.ADMode.Primal or marched.trained
+            whole = marched.differentiated if exact else marched.marched
             self.samples = place_samples(
-                marched.marched,
+                whole,
                 dr.detach(o),
                 dr.detach(d),
                 jitter=rays.jitter,
@@ -54,10 +60,20 @@ class Crossing:
             self._edges: Any = None
             if moving:
                 self._move(ray_segments(self.field, o, d, bounds))
-        stop = self._march.stop if mode == dr.ADMode.Primal else 0.0
-        self.evaluation = Evaluation(
-            self.field, self.samples, self._march.block, stop=stop, emission=emission
-        )
+        block = self._march.block
+        few = self.samples.queries <= _KEPT
+        keep = mode == dr.ADMode.Backward and self.differentiable and few
+        with dr.resume_grad(when=keep):
+            self.evaluation = Evaluation(
+                self.field,
+                self.samples,
+                block,
+                keep=keep,
+                stop=whole.settings.stop,
+                tail=-(-block // 2) if exact else None,
+                fuse=not exact,
+                emission=emission,
+            )
 
     def prepare(self, mode: dr.ADMode) -> None:
         """Makes the field's answers the leaves of what is computed next."""

@@ -11,7 +11,7 @@ import mitsuba as mi
 from .backdrop import Backdrop, Hit, Light
 from .colors import Radiance, Spectrum
 from .film import CameraRays, Channels
-from .integral import Integral, Seen, chunks, see
+from .integral import Integral, Seen, chunks, few, scattered, see
 from .sampled import Rays, SampledField
 
 
@@ -23,6 +23,7 @@ class Traced:
     hit: Hit
     seen: Seen  # of the fields before it
     light: Light  # from behind them
+    kept: tuple[Any, Integral] | None = None  # of which rays, what its adjoint is made of
 
     @property
     def outputs(self) -> list[Any]:
@@ -61,18 +62,46 @@ class FieldScene:
     def __init__(self, fields: list[SampledField], backdrop: Backdrop, normals: bool):
         self._fields, self._backdrop, self._normals = fields, backdrop, normals
 
-    def trace(self, camera: CameraRays) -> Traced:
-        """What the rays of a pass see, without derivatives."""
+    def trace(self, camera: CameraRays, *, keep: bool = False) -> Traced:
+        """What the rays of a pass see, without derivatives.
+
+        With ``keep``, few rays are asked once for both their values and their derivatives;
+        normals and indices, which have none, are then left out.
+        """
         hit = self._backdrop.intersect(camera.ray)
-        seen = see(self._fields, _rays(camera, hit), normals=self._normals)
+        rays = _rays(camera, hit)
+        kept = self._keep(rays) if keep else None
+        if kept is None:
+            seen = see(self._fields, rays, normals=self._normals)
+        else:
+            seen = scattered(*kept, dr.width(rays.o))
         light = self._backdrop.shade(hit, camera.ray, camera.sampler, seen.opacity)
-        return Traced(camera, hit, seen, light)
+        return Traced(camera, hit, seen, light, kept)
+
+    @property
+    def trained(self) -> bool:
+        """Whether all fields are being trained."""
+        return all(marched.trained for marched in self._fields)
+
+    def _keep(self, rays: Rays) -> tuple[Any, Integral] | None:
+        """The integral along few rays, and their numbers; ``None`` of many."""
+        if not (self._differentiable() and few(self._fields, rays)):
+            return None
+        index, rays = next(iter(chunks(self._fields, rays)))
+        return index, Integral(self._fields, rays, dr.ADMode.Backward)
+
+    def _differentiable(self) -> bool:
+        return any(marched.differentiable for marched in self._fields)
 
     def backward(self, traced: Traced, gradients: list[Any]) -> None:
         """Carries the gradients of ``outputs`` to the parameters of the scene."""
         camera, light = traced.camera, traced.light
         self._backdrop.backward(camera.ray, camera.sampler, light, gradients[5:])
-        if not any(marched.differentiable for marched in self._fields):
+        if not self._differentiable():
+            return
+        if traced.kept is not None:
+            index, integral = traced.kept
+            integral.backward([dr.gather(mi.Float, g, index) for g in gradients[:5]])
             return
         for index, rays in chunks(self._fields, _rays(camera, traced.hit)):
             integral = Integral(self._fields, rays, dr.ADMode.Backward)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -44,6 +44,10 @@ class Traced(Protocol):
     def outputs(self) -> list[Any]:
         """The arrays of which the channels are made, where derivatives can be had."""
 
+    @property
+    def camera(self) -> CameraRays:
+        """The rays themselves."""
+
     def channels(self) -> Channels:
         """What the rays show."""
 
@@ -51,8 +55,12 @@ class Traced(Protocol):
 class TracedScene(Protocol):
     """A scene as it is now, to be seen along camera rays."""
 
-    def trace(self, camera: CameraRays) -> Any:
-        """What the rays find, a :class:`Traced`; without derivatives."""
+    def trace(self, camera: CameraRays, *, keep: bool = False) -> Any:
+        """What the rays find, a :class:`Traced`; without derivatives.
+
+        Args:
+            keep: what :meth:`backward` will need, as far as it is small.
+        """
 
     def backward(self, traced: Any, gradients: list[Any]) -> None:
         """Carries gradients of the ``outputs`` to the parameters of the scene."""
@@ -79,6 +87,7 @@ class FieldIntegrator(ADIntegrator):
         # Read by the base class in C++; kept here for the background.
         self.show_background = not bool(props.get("hide_emitters", False))
         self.aovs = self._parse_aovs(str(props.get("aovs", "")))
+        self._shown: _Shown | None = None
 
     def aov_names(self) -> list[str]:
         """Names of the extra channels."""
@@ -98,6 +107,10 @@ class FieldIntegrator(ADIntegrator):
     def _scene(self, scene: mi.Scene) -> Any:
         """The scene as it is now: a :class:`TracedScene`, without derivatives only ``trace``."""
 
+    def _trains(self, view: Any, sensor: mi.Sensor, spp: int) -> bool:
+        """Whether the picture is a step of training, whose derivatives take the same samples."""
+        return False
+
     # ---------------------------------- Rendering ----------------------------------
 
     def render(
@@ -110,12 +123,17 @@ class FieldIntegrator(ADIntegrator):
         evaluate: bool = True,
     ) -> Any:
         """Renders an image; see ``mi.render``."""
+        self._require_thawed()
         sensor = self._sensor(scene, sensor)
         film, block = sensor.film(), None
         with dr.suspend_grad():
             view = self._scene(scene)
+            self._shown, trains = None, self._trains(view, sensor, spp)
             for camera in self._passes(scene, sensor, seed, spp, self.rays_per_pass):
-                block = self._splat(film, block, camera, view.trace(camera).channels())
+                traced = view.trace(camera, keep=True) if trains else view.trace(camera)
+                block = self._splat(film, block, camera, traced.channels())
+                if trains:  # all rays are one pass
+                    self._shown = _Shown(scene, sensor, _seed_grad(seed), spp, view, traced)
             film.put_block(block)
             image = film.develop() if develop else None
             if evaluate and develop:
@@ -132,6 +150,7 @@ class FieldIntegrator(ADIntegrator):
         **kwargs: Any,
     ) -> tuple[Any, Any, list[Any], Any]:
         """Radiance along single rays, for integrators that nest this one; 0 if not active."""
+        self._require_thawed()
         with dr.suspend_grad():
             random = self._draw(sampler, dr.width(ray), 0)
             camera = CameraRays(ray, None, None, random, sampler)
@@ -163,15 +182,22 @@ class FieldIntegrator(ADIntegrator):
         sensor = self._sensor(scene, sensor)
         film, limit = sensor.film(), self.rays_per_adjoint
         with dr.suspend_grad():
-            view: TracedScene = self._scene(scene)
-            sums = self._weights(scene, sensor, seed, spp)
+            shown, self._shown = self._shown, None
+            if shown is not None and shown.is_of(scene, sensor, seed, spp):
+                view: TracedScene = shown.view
+                cameras: Iterable[CameraRays] = [shown.traced.camera]
+                film.prepare(self.aov_names())
+            else:
+                shown, view = None, self._scene(scene)
+                cameras = _Kept(lambda: self._passes(scene, sensor, seed, spp, limit))
+            sums = self._weights(film, cameras)
             with dr.resume_grad():
                 dr.enable_grad(sums.tensor())
                 film.put_block(sums)
                 _pull(film.develop(), grad_in)
                 adjoint = dr.grad(sums.tensor())
-            for camera in self._passes(scene, sensor, seed, spp, limit):
-                traced: Traced = view.trace(camera)
+            for camera in cameras:
+                traced: Traced = shown.traced if shown else view.trace(camera, keep=True)
                 outputs = traced.outputs
                 with dr.resume_grad():
                     dr.enable_grad(outputs)
@@ -197,9 +223,10 @@ class FieldIntegrator(ADIntegrator):
         film, limit = sensor.film(), self.rays_per_adjoint
         with dr.suspend_grad():
             view: TracedScene = self._scene(scene)
-            sums = self._weights(scene, sensor, seed, spp)
+            cameras = _Kept(lambda: self._passes(scene, sensor, seed, spp, limit))
+            sums = self._weights(film, cameras)
             tangent = dr.zeros(mi.TensorXf, sums.tensor().shape)
-            for camera in self._passes(scene, sensor, seed, spp, limit):
+            for camera in cameras:
                 traced: Traced = view.trace(camera)
                 outputs, slopes = traced.outputs, view.forward(traced)
                 with dr.resume_grad():
@@ -223,18 +250,28 @@ class FieldIntegrator(ADIntegrator):
         return InputError(f"{self.plugin}: {name}={value}, expected {expected}")
 
     def _require_derivatives(self) -> None:
+        self._require_thawed()
         if not self.differentiable:
             raise InputError(
                 f"{self.plugin}: has no derivatives, expected the integrator 'nerf' for them"
             )
 
-    def _weights(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> mi.ImageBlock:
+    def _require_thawed(self) -> None:
+        """Refuses to be recorded: Dr.Jit cannot pack a network's weights there, either."""
+        if dr.flag(dr.JitFlag.FreezingScope):
+            raise InputError(
+                f"{self.plugin}: inside dr.freeze a picture would be repeated with the numbers of "
+                "samples and the places of fields that it has read once, expected mi.render "
+                "outside of the frozen function"
+            )
+
+    def _weights(self, film: mi.Film, cameras: Iterable[CameraRays]) -> mi.ImageBlock:
         """The film's sums of an image that is black: only the weights of the samples."""
         block, zero = None, mi.Float(0)
         black: Channels = dict.fromkeys(self.known, zero)
         black |= {"color": Radiance([zero] * 3), "alpha": zero, "normal": mi.Normal3f(0)}
-        for camera in self._passes(scene, sensor, seed, spp, self.rays_per_adjoint):
-            block = self._splat(sensor.film(), block, camera, black)
+        for camera in cameras:
+            block = self._splat(film, block, camera, black)
         return block
 
     # ---------------------------------- Camera rays ----------------------------------
@@ -313,6 +350,47 @@ class FieldIntegrator(ADIntegrator):
             if item:
                 aovs.append((name or kind, kind))
         return aovs
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """What the last picture was made of, if its derivatives shall be those of the same samples."""
+
+    scene: mi.Scene
+    sensor: mi.Sensor
+    seed_grad: Any
+    spp: int
+    view: TracedScene
+    traced: Any
+
+    def is_of(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> bool:
+        """Whether a derivative is that of this picture, with the seed that Mitsuba gives it."""
+        same = self.scene is scene and self.sensor is sensor and self.spp == spp
+        return same and isinstance(seed, int) and seed == self.seed_grad
+
+
+def _seed_grad(seed: Any) -> Any:
+    """The seed of the derivatives of a picture, as ``mi.render`` has it by default."""
+    return mi.sample_tea_32(seed, 1)[0] if isinstance(seed, int) else None
+
+
+class _Kept:
+    """Camera rays that are gone through several times: made once if they are one pass."""
+
+    def __init__(self, passes: Callable[[], Iterator[CameraRays]]) -> None:
+        self._passes = passes
+        self._only: CameraRays | None = None
+
+    def __iter__(self) -> Iterator[CameraRays]:
+        if self._only is not None:
+            yield self._only
+            return
+        passes = self._passes()
+        self._only = next(passes)
+        yield self._only
+        for camera in passes:
+            self._only = None
+            yield camera
 
 
 def _pull(value: Any, gradient: Any) -> None:

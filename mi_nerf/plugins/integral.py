@@ -19,6 +19,10 @@ from .colors import emission
 from .crossing import Crossing, crossings
 from .sampled import Rays, SampledField
 
+# Samples up to which rays are marched together, whether or not they cross a field: to find
+# out takes as long.
+_FEW = 1 << 18
+
 
 @dataclass(frozen=True)
 class Seen:
@@ -47,7 +51,7 @@ def see(fields: list[SampledField], rays: Rays, *, normals: bool = False) -> See
     index = dr.zeros(mi.Float, count)
     normal = mi.Normal3f(*(dr.zeros(mi.Float, count) for _ in range(3)))
     dr.make_opaque(values, index, normal)
-    walks = len(fields) == 1 and not normals and can_walk(fields[0].marched)
+    walks = len(fields) == 1 and not normals and _walks(fields[0])
     for where, part in chunks(fields, rays, whole=walks):
         integral = (
             _walked(fields[0], part)
@@ -61,6 +65,21 @@ def see(fields: list[SampledField], rays: Rays, *, normals: bool = False) -> See
             dr.scatter(normal, mi.Normal3f(*integral.normal), where)
         dr.eval(values, index, normal)
     return Seen(values, normal, index, rays.wavelengths)
+
+
+def scattered(index: Any, integral: Integral, count: int) -> Seen:
+    """What ``count`` rays see, of which the rays ``index`` cross a field; without normals."""
+    values = [dr.zeros(mi.Float, count) for _ in range(5)]
+    dr.make_opaque(values)
+    for output, value in zip(values, integral.values, strict=True):
+        dr.scatter(output, dr.detach(value), index)
+    dr.eval(values)
+    return Seen(values, mi.Normal3f(0), mi.Float(0))
+
+
+def _walks(marched: SampledField) -> bool:
+    """Whether rays walk through a field in one kernel."""
+    return can_walk(marched.marched) and not marched.trained
 
 
 def _walked(marched: SampledField, rays: Rays) -> Seen:
@@ -81,7 +100,7 @@ def transmittance(fields: list[SampledField], rays: Rays) -> Any:
     total = dr.zeros(mi.Float, len(rays.o[0]))
     dr.make_opaque(total)
     for marched in fields:
-        walks = can_walk(marched.marched)
+        walks = _walks(marched)
         for where, part in chunks([marched], rays, whole=walks):
             depth = (
                 marched.walk(part, emission=False)[0].optical_depth
@@ -192,10 +211,21 @@ class Integral:
         self.normal = [n * inverse for n in sums]
 
 
+def few(fields: list[SampledField], rays: Rays) -> bool:
+    """Whether rays have so few samples that they are marched together."""
+    most = sum(marched.march.samples + marched.march.fine for marched in fields)
+    return len(rays.o[0]) * most <= _FEW
+
+
 def chunks(
     fields: list[SampledField], rays: Rays, *, whole: bool = False
 ) -> Iterator[tuple[Any, Rays]]:
     """The rays that cross any field, with their numbers: in parts of bounded memory, or whole."""
+    if few(fields, rays) and not whole:
+        index = dr.arange(mi.UInt32, len(rays.o[0]))
+        dr.eval(index, rays)
+        yield index, rays
+        return
     samples = dr.zeros(mi.UInt32, len(rays.o[0]))  # of all fields along each ray
     for marched in fields:
         count = dr.opaque(mi.UInt32, marched.march.samples + marched.march.fine)

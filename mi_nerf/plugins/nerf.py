@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 
 from ..base.errors import InputError
@@ -14,6 +15,9 @@ from .film import FieldIntegrator
 from .marching import MarchingIntegrator
 from .placement import find_fields
 from .solid_scene import SolidScene, has_surfaces
+
+# Camera rays up to which a picture of fields in training keeps what its derivatives need.
+_BATCH = 1 << 14
 
 
 class NerfIntegrator(MarchingIntegrator):
@@ -181,6 +185,11 @@ class NerfIntegrator(MarchingIntegrator):
         else:
             backdrop = Surfaces(self._solid.of(scene), self.nested, self.paths, normals)
         return FieldScene(fields, backdrop, normals)
+
+    def _trains(self, view: FieldScene, sensor: mi.Sensor, spp: int) -> bool:
+        rays = int(dr.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count())
+        frozen = dr.flag(dr.JitFlag.FreezingScope)
+        return view.trained and rays <= _BATCH and not self.aovs and not frozen
 
     def _warn_of_surfaces(self, scene: mi.Scene) -> None:
         if not self._warned and has_surfaces(scene):

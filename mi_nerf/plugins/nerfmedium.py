@@ -10,9 +10,11 @@ import numpy as np
 
 from ..base.errors import InputError
 from ..fields.closed_form import closed_form
+from ..fields.neural import NeuralFieldConfig
 from ..formats.field_file import FieldFile, load_field
 from ..march.followed import FollowedGrid
 from ..march.settings import MarchSettings
+from ..march.trained import HIDDEN, TrainedGrid
 
 
 class NerfMedium(mi.Medium):
@@ -37,6 +39,15 @@ class NerfMedium(mi.Medium):
        - |bool|
        - Skip the cells that the field file marks as empty. When weights change, so do these
          cells: the field is looked at again before the next picture. (Default: true)
+     * - training
+       - |bool|
+       - The weights are trained from the start, step by step, as ``mi-nerf train`` does. Cells
+         that the file marks as empty stay so for good, and some of the others are looked at
+         again every 16 changes of the weights. Pictures of up to 16384 rays, while weights have
+         gradients, and their derivatives take the same samples, without those behind an
+         optical depth of 10 of what was always seen dense: derivatives are those of the very
+         picture, its noise included, instead of having a seed of their own. (Default: false, all
+         cells are looked at after every change)
      * - to_world
        - |transform|
        - Moves the field within the cube's coordinate system: applied before the cube's own
@@ -147,11 +158,13 @@ class NerfMedium(mi.Medium):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self._use_occupancy = bool(props.get("occupancy", True))
+        self.training = bool(props.get("training", False))
         matrix = props.get("to_world", mi.ScalarTransform4f()).matrix
         self.to_world = mi.Transform4f(np.array(matrix, np.float32))
         self._grid: Any = None
         self._contents: FieldFile | None = None  # what the grid belongs to, until weights change
         self._stale, self._checked = False, False
+        self._config: NeuralFieldConfig | None = None  # none of a formula
         self.field: Any
         if "field" in props:
             self._describe_formula(props)
@@ -167,7 +180,7 @@ class NerfMedium(mi.Medium):
         self._source = path
         self.field, self._grid = contents.build(mi)
         self._contents = contents if self._use_occupancy and self._grid is not None else None
-        self.march = contents.march
+        self.march, self._config = contents.march, contents.config
 
     def _describe_formula(self, props: mi.Properties) -> None:
         if "filename" in props:
@@ -186,13 +199,41 @@ class NerfMedium(mi.Medium):
         if not self._use_occupancy or self._grid is None:
             return None
         if self._stale:
-            if self._contents is not None:  # from here on, any cell may fill
-                before, _ = self._contents.build(mi)
-                self._grid = FollowedGrid(self._grid, before, mi.Float)
+            if self._contents is not None:
+                self._grid = self._moving_grid(self._contents)
                 self._contents = None
             self._grid.follow(self.field)
             self._stale = False
         return self._grid
+
+    def _moving_grid(self, contents: FieldFile) -> Any:
+        """A grid that keeps up with the weights, from the file's."""
+        if self.training:
+            return TrainedGrid(self._grid, mi.Float)
+        before, _ = contents.build(mi)  # from here on, any cell may fill
+        return FollowedGrid(self._grid, before, mi.Float)
+
+    @property
+    def hidden(self) -> float:
+        """The optical depth behind which derivatives leave out samples; 0: none."""
+        return HIDDEN if self.training else 0.0
+
+    def field_file(self) -> FieldFile:
+        """The field as it is now, for :func:`mi_nerf.save_field`.
+
+        Raises:
+            InputError: if it is given by a formula.
+        """
+        if self._config is None:
+            raise InputError(f"nerfmedium: '{self._source}' is a formula, expected a network")
+        coarse, grid = self.field.coarse, self.occupancy
+        return FieldFile(
+            self._config,
+            self.field.weights(),
+            None if grid is None else grid.mask(),
+            self.march,
+            coarse=None if coarse is None else coarse.weights(),
+        )
 
     def traverse(self, callback: Any) -> None:
         """Exposes every tensor of the network, and ``to_world``, as differentiable parameters."""

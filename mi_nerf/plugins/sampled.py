@@ -37,6 +37,17 @@ class SampledField:
         """The field in its own coordinates."""
         return MarchedField(self.field, self.march, self.placed.medium.occupancy)
 
+    @property
+    def trained(self) -> bool:
+        """Whether this is a step of training: what is seen takes the samples of the derivatives."""
+        return self.placed.medium.training and self.differentiable
+
+    @property
+    def differentiated(self) -> MarchedField:
+        """The field for derivatives: its rays do not end, but for what training leaves out."""
+        settings = replace(self.march, stop=0.0, hidden=self.placed.medium.hidden)
+        return replace(self.marched, settings=settings)
+
     def walk(self, rays: Rays, *, emission: bool = True) -> tuple[Walked, Any]:
         """What rays see, see :func:`mi_nerf.march.walk.walk_rays`; and local per world length."""
         o, d, scale = self.placed.to_local(rays.o, rays.d)

@@ -26,13 +26,13 @@ from ..cameras.pinhole import Intrinsics
 from ..data import Dataset, load_dataset
 from ..formats.field_file import FieldFile, save_field
 from ..march.marched import MarchedField
-from ..march.settings import MarchSettings
 from ..march.view import View, display_image, render_view
 from .auto import Choice, Decision, choose
 from .checkpoint import Progress, load_checkpoint, save_checkpoint
 from .config import TrainConfig, to_json
 from .device import for_device
 from .forecast import PUBLISHED_STEPS, Forecast, forecast
+from .fresh import field_file, render_settings
 from .progress import Meter, ProgressBar
 from .run_folder import CHECKPOINT, CONFIG, FIELD, FORMAT, LOG, cut_log, read_config
 from .scaling import summary
@@ -187,7 +187,7 @@ class Run:
         trainer = self.trainer
         with dr.suspend_grad():
             return render_view(
-                MarchedField(trainer.field, self._render_settings(), trainer.occupancy),
+                MarchedField(trainer.field, render_settings(self.config), trainer.occupancy),
                 intrinsics,
                 cam_to_world,
                 array_module(self.variant),
@@ -207,32 +207,7 @@ class Run:
 
     def field_file(self) -> FieldFile:
         """The field as it is now, as XML scenes will load it."""
-        trainer = self.trainer
-        return FieldFile(
-            trainer.field_config,
-            trainer.field.weights(),
-            trainer.occupancy.mask() if trainer.occupancy is not None else None,
-            self._render_settings(),
-            {
-                "mi_nerf": __version__,
-                "preset": self.config.preset,
-                "steps": trainer.step_count,  # that these weights have seen
-                "seconds": round(self.seconds, 3),
-            },
-            None if trainer.field.coarse is None else trainer.field.coarse.weights(),
-        )
-
-    def _render_settings(self) -> MarchSettings:
-        """How rays are sampled when nothing is trained."""
-        sampling = self.config.sampling
-        return MarchSettings(
-            samples=sampling.render_samples,
-            fine=sampling.fine if sampling.render_fine is None else sampling.render_fine,
-            near=sampling.near,
-            far=sampling.far,
-            rule=sampling.rule,
-            stop=sampling.render_stop,
-        )
+        return field_file(self.trainer, {"seconds": round(self.seconds, 3)})
 
     # ---------------------------------- The clock ----------------------------------
 

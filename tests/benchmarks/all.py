@@ -68,6 +68,7 @@ PLAN = (
     Task(3, "tests.benchmarks.composite"),
     Task(4, "tests.benchmarks.generate"),
     Task(4, "tests.benchmarks.inverse_loop"),
+    Task(4, "tests.benchmarks.native"),
     Task(12, "tests.benchmarks.reduced_paper"),
     Task(15, "tests.benchmarks.robustness --out runs/robustness --set collapse_check=150"),
     Task(140, "tests.benchmarks.resolution --seconds 3600", compares=True),

@@ -14,6 +14,7 @@ import mitsuba as mi
 import pytest
 
 import mi_nerf
+from tests.support.datasets import write_blob_dataset
 from tests.support.fields import small_file
 
 PLUGINS = Path(mi_nerf.__file__).parent / "plugins"
@@ -28,6 +29,7 @@ def registered() -> dict[str, tuple[str, str, str]]:
             if isinstance(node, ast.Call) and function in (
                 "register_integrator",
                 "register_medium",
+                "register_sensor",
             ):
                 name, made = node.args
                 kind = function.removeprefix("register_")
@@ -61,7 +63,7 @@ def documented(name: str) -> dict[str, list[str]]:
 
 
 def test_the_plugins_are_found() -> None:
-    assert {"nerf", "nerf_tracking", "nerfmedium"} <= set(NAMES)
+    assert {"nerf", "nerf_tracking", "nerfmedium", "nerfviews"} <= set(NAMES)
 
 
 @each
@@ -86,7 +88,7 @@ def test_every_property_is_documented(name: str) -> None:
     for cls in plugin(name).__mro__:
         if cls.__module__.startswith("mi_nerf"):
             source = textwrap.dedent(inspect.getsource(cls))
-            read |= set(re.findall(r'props(?:\.get\(|\[)"(\w+)"', source))
+            read |= set(re.findall(r'props(?:\.get\(|\[)"(\w+)"(?!\] = )', source))
     assert read and read <= set(known), read - set(known)
 
 
@@ -106,14 +108,18 @@ def example(name: str, language: str, folder: Path) -> str:
     text = inspect.getdoc(plugin(name)) or ""
     found = re.search(rf"\.\. code-tab:: {language}\n\n((?: +.*\n?|\n)+)", text)
     assert found is not None
-    return textwrap.dedent(found[1].split("\n    .. code-tab")[0]).replace(
-        "lego.safetensors", str(small_file(folder))
-    )
+    text = textwrap.dedent(found[1].split("\n    .. code-tab")[0])
+    if name == "nerfviews":
+        data = folder if (folder / "train").exists() else write_blob_dataset(folder)
+        return re.sub("""(["'])lego["']""", rf"\1{data}\1", text)
+    return text.replace("lego.safetensors", str(small_file(folder)))
 
 
 def load(xml: str) -> Any:
     scene = mi.load_string(f'<scene version="3.0.0">{xml}</scene>')
-    return scene.shapes()[0] if scene.shapes() else scene.integrator()
+    if scene.shapes():
+        return scene.shapes()[0]
+    return scene.integrator() or scene.sensors()[0]
 
 
 @each
