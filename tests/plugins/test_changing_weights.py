@@ -178,16 +178,18 @@ def test_a_field_that_vanishes_and_comes_back(variant: str, tmp_path: Path) -> N
     np.testing.assert_allclose(np.array(mi.render(scene, seed=0)), before, atol=0.02)
 
 
-def test_weights_that_are_no_numbers_neither_crash_nor_empty_the_grid(
+def test_weights_that_are_no_numbers_are_refused_and_do_not_empty_the_grid(
     variant: str, tmp_path: Path
 ) -> None:
     scene = scene_of(saved(tmp_path, sheet(*SHEET), cells_of(sheet(*SHEET))))
     params = mi.traverse(scene)
     put(params, {n: np.full_like(w, np.nan) for n, w in sheet(*SHEET).items()})
-    mi.render(scene, seed=0)
-    assert medium_of(scene).occupancy.fraction() == 1
+    with pytest.raises(RuntimeError) as caught:
+        mi.render(scene, seed=0)
+    assert "NaN or infinite" in str(caught.value.__cause__ or caught.value)
     put(params, sheet(*SHEET))
     assert np.isfinite(np.array(mi.render(scene, seed=0))).all()
+    assert medium_of(scene).occupancy.fraction() > 0
 
 
 def test_a_loop_compiles_nothing_and_its_gradients_are_those_of_the_field(
