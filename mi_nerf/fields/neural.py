@@ -21,7 +21,7 @@ from .activations import ColorActivation, DensityActivation, apply_activation
 from .blas_network import network_product, worth_blas
 from .fourier import FourierEncoding, stack_rows
 from .frozen_features import FrozenFeatures
-from .fused_network import FusedNetwork, HalfNetwork, fused_network
+from .fused_network import FusedNetwork, HalfNetwork, fused_network, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
 from .host_network import HostNetwork, on_host
 from .network import NetworkConfig, rows
