@@ -45,13 +45,19 @@ def data_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ["seconds", "cpu_seconds"],
         ),
         (
+            "frames --presets fast --steps 3 --size 12 12 --frames 1 --repeats 1",
+            "frames",
+            ["fast", "12×12", "all", "this"],
+            ["busy", "wall", "first"],
+        ),
+        (
             "rules --preset fast --seconds 2 --views 2 --rays 64",
             "rules_trained",
             ["fast", "256"],
             ["constant_off", "jittered_linear_psnr"],
         ),
     ],
-    ids=["quality", "reduced_paper", "startup", "rules"],
+    ids=["quality", "reduced_paper", "startup", "frames", "rules"],
 )
 def test_it_saves_rows(
     words: str, name: str, labels: list[str], figures: list[str], data_root: Path, tmp_path: Path

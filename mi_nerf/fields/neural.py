@@ -21,8 +21,9 @@ from .activations import ColorActivation, DensityActivation, apply_activation
 from .blas_network import network_product, worth_blas
 from .fourier import FourierEncoding, stack_rows
 from .frozen_features import FrozenFeatures
-from .fused_network import FusedNetwork, HalfNetwork, fused_network
+from .fused_network import FusedNetwork, HalfNetwork, fused_network, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
+from .host_network import HostNetwork, on_host
 from .network import NetworkConfig, rows
 from .noise import DensityNoise
 from .protocol import Field
@@ -176,7 +177,7 @@ class NeuralField(Field):
         return found
 
     def density(self, p: Vectors) -> Floats:
-        if self._on_host and not _recorded():
+        if self._multiplies_on_host(p):
             return self._density(self._product(p)[0], p)
         raw = network.density_head(self.config.network, self._weights, self._trunk(p))
         return self._density(raw, p)
@@ -186,7 +187,7 @@ class NeuralField(Field):
         config = self.config
         if self._loss_scale is not None:
             return self._answer(HalfNetwork(config.network, self._weights, self._loss_scale), p, d)
-        if self._on_host and not _recorded():
+        if self._multiplies_on_host(p):
             density, *color = self._product(p, d)
             return self._density(density, p), self._color(color)
         h, direction = self._trunk(p), self._direction(d)
@@ -222,6 +223,32 @@ class NeuralField(Field):
             return self._density(density, p), self._color(color)
 
         return density_emission
+
+    def at_once(self, emission: bool = True) -> Callable[..., Any] | None:
+        """See :meth:`Field.at_once`; ``None`` where a kernel is faster, or the host is none."""
+        config, float_type = self.config, type(next(iter(self._weights.values())).array)
+        if not on_host(float_type) or worth_fusing(config.network, float_type):
+            return None
+        host = HostNetwork(config.network, self._weights, emission=emission)
+
+        def answers(p: Vectors, d: Vectors) -> list[Floats]:
+            features = {"position": self._features(p)}
+            if emission and config.network.view_dependent:
+                features["direction"] = config.direction.features(d)
+            density, *color = host(features, dr.width(p))
+            found = [self._density(density, p), *self._color(color)]
+            dr.eval(found)
+            return found
+
+        return answers
+
+    def _multiplies_on_host(self, p: Vectors) -> bool:
+        """Whether products are best left to the host: wide ones where no gradient is wanted."""
+        if _recorded():
+            return False
+        return self._on_host or (
+            on_host(type(p[0])) and not dr.grad_enabled(p, dict(self._weights))
+        )
 
     def _answer(self, fused: FusedNetwork, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         config = self.config

@@ -51,3 +51,11 @@ class Field(ABC):
         """:meth:`fused` as a function of positions alone, for many along the same directions."""
         ask = self.fused()
         return None if ask is None else lambda p: ask(p, d)
+
+    def at_once(self, emission: bool = True) -> Callable[..., Any] | None:
+        """A function of N positions and directions, for any N and without gradients.
+
+        It evaluates density, and with ``emission`` the three channels of colour, as a list.
+        ``None`` where many at a time are no faster.
+        """
+        return None

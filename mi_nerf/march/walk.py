@@ -1,4 +1,4 @@
-"""Marches rays through a field in one kernel: a loop from one occupied sample to the next.
+"""Marches rays through a field from one occupied sample to the next.
 
 Each ray walks over its strata, leaving empty bricks of the occupancy grid at once, asks the
 field where it may be dense, and ends at its transmittance. The samples are those that
@@ -6,6 +6,9 @@ field where it may be dense, and ends at its transmittance. The samples are thos
 order in which sums are rounded; it ends at the very sample behind which less than ``stop``
 passes, not after the round in which that was noticed. Nothing is stored but a few numbers a
 ray. There are no derivatives.
+
+Where the field may be asked within a kernel, all of this is one; else it happens in
+:mod:`waves <mi_nerf.march.waves>` of many rays.
 """
 
 from __future__ import annotations
@@ -17,11 +20,12 @@ from typing import Any
 
 import drjit as dr
 
-from ..base.arrays import Floats, Indices, Mask, Vectors, vector3_type
+from ..base.arrays import Floats, Indices, Mask, Vectors
 from .intervals import RaySegments, ray_segments
 from .marched import MarchedField
-from .occupancy import OccupancyGrid
+from .path import Path
 from .rules import one_minus_exp, opaque_at_most
+from .waves import Waves
 
 
 @dataclass
@@ -32,16 +36,17 @@ class Walked:
     optical_depth: Floats  # R values
     opacity: Floats  # R values in [0, 1]
     depth: Floats  # R values: mean distance under the weights, scene units; 0 where none
-    queries: Indices  # R numbers: how often the field was asked
+    queries: Indices  # R numbers: how often the field was asked; in waves, in vain at the ends
 
 
 def can_walk(marched: MarchedField) -> bool:
-    """Whether a field may be asked within a kernel, and its samples are found one by one."""
+    """Whether a field can be asked so, and its samples are found one by one."""
     settings, field = marched.settings, marched.field
     refined = field.coarse is not None and settings.fine > 0
     if settings.rule != "constant" or settings.hidden > 0 or refined:
         return False
-    return field.fused(emission=False) is not None
+    ways = (field.fused, field.at_once)
+    return any(way(emission=False) is not None for way in ways)
 
 
 def walk_rays(
@@ -64,9 +69,11 @@ def walk_rays(
         within = ray_segments(field, o, d, (settings.near, settings.far), bounds)
         dr.eval(within.o, within.d, within.view, within.near, within.far)
         ask = field.fused_along(within.view) if emission else field.fused(emission=False)
-        assert ask is not None
-        path = _Path(within, settings.samples, jitter, marched.occupancy)
-        tau, queries, *channels = _march(path, ask, settings.stop, emission)
+        if ask is not None:
+            path = Path(within, settings.samples, jitter, marched.occupancy)
+            tau, queries, *channels = _march(path, ask, settings.stop, emission)
+        else:
+            tau, queries, *channels = _in_waves(marched, within, jitter, emission)
         opacity = one_minus_exp(tau)
         depth = opacity
         if emission:
@@ -77,81 +84,19 @@ def walk_rays(
     return Walked(channels, tau, opacity, depth, queries)
 
 
-class _Path:
-    """The strata of rays, and where along them the next sample is that may be dense."""
-
-    def __init__(
-        self, within: RaySegments, samples: int, jitter: Floats, grid: OccupancyGrid | None
-    ) -> None:
-        self.hit, self.samples, self._grid = within.hit, samples, grid
-        self._o, self._d, self._near = within.o, within.d, within.near
-        self.width = (within.far - within.near) * (1 / samples)  # as stratified() has it
-        float_type = type(within.near)
-        self.vector = vector3_type(float_type)
-        self._offset = float_type(0.5) if jitter is None else jitter
-        if grid is None:
-            return
-        # Rays in units of cells: only to guess where bricks end.
-        rate = [float(1 / size) for size in grid.cell_size]
-        self._bits = grid.bits()
-        self._start = [(within.o[i] - float(grid.lower[i])) * rate[i] for i in range(3)]
-        slope = [within.d[i] * rate[i] for i in range(3)]
-        self._ahead = [s > 0 for s in slope]
-        # Where a ray runs along a face, another one is left before.
-        self._pace = [
-            dr.select(dr.abs(s) < 1e-20, dr.inf, 1 / dr.select(dr.abs(s) < 1e-20, 1, s))
-            for s in slope
-        ]
-
-    def at(self, stratum: Indices) -> tuple[Floats, Vectors]:
-        """Parameters and positions of the samples in strata of the rays."""
-        float_type = type(self._near)
-        t = dr.fma(float_type(stratum) + self._offset, self.width, self._near)
-        return t, self.vector(*(dr.fma(t, self._d[i], self._o[i]) for i in range(3)))
-
-    def next(self, stratum: Indices) -> Indices:
-        """The next sample, from this one on, in an occupied cell; S behind the last one."""
-        if self._grid is None:
-            return stratum
-        last = dr.uint32_array_t(type(self._near))(self.samples)
-
-        def going(stratum: Indices, searching: Mask) -> Mask:
-            return searching & (stratum < last)
-
-        def step(stratum: Indices, searching: Mask) -> tuple[Indices, Mask]:
-            stratum, found = self._step(stratum)
-            return stratum, ~found
-
-        searching = dr.mask_t(type(self._near))(True)
-        stratum, _ = dr.while_loop(
-            (stratum, searching), going, step, labels=("stratum", "searching")
-        )
-        return stratum
-
-    def _step(self, stratum: Indices) -> tuple[Indices, Mask]:
-        """Stays at a sample that may be dense, or leaves the empty brick around it."""
-        assert self._grid is not None
-        cell = self._grid.coordinates(self.at(stratum)[1])
-        found, edge = self._bits.look(cell)
-        brick = [c >> edge for c in cell]
-        leave = type(self._near)(dr.inf)
-        for i in range(3):
-            face = type(leave)((brick[i] + dr.select(self._ahead[i], 1, 0)) << edge)
-            time = (face - self._start[i]) * self._pace[i]
-            leave = dr.select(time < leave, time, leave)
-        guess = dr.floor((leave - self._near) / self.width - self._offset)
-        guess = dr.fmin(dr.fmax(guess, type(leave)(stratum)), self.samples - 1)
-        end = type(stratum)(guess)
-        # Cells ascend or descend along a ray, rounding included: if this sample is still in
-        # the brick, all before it are.
-        inside = dr.mask_t(type(leave))(True)
-        for c, b in zip(self._grid.coordinates(self.at(end)[1]), brick, strict=True):
-            inside &= (c >> edge) == b
-        beyond = dr.select(inside, end, stratum) + 1
-        return dr.select(found, stratum, beyond), found
+def _in_waves(
+    marched: MarchedField, within: RaySegments, jitter: Floats, emission: bool
+) -> list[Any]:
+    """As :func:`_march`, for a field that is asked about many points at once."""
+    settings, ask = marched.settings, marched.field.at_once(emission)
+    assert ask is not None
+    waves = Waves(within, settings.samples, jitter, marched.occupancy, settings.stop, emission)
+    waves.run(ask)
+    tau, *channels = waves.seen
+    return [tau, waves.queries, *channels]
 
 
-def _march(path: _Path, ask: Callable[..., Any], stop: float, emission: bool) -> list[Any]:
+def _march(path: Path, ask: Callable[..., Any], stop: float, emission: bool) -> list[Any]:
     """Optical depth, queries, and with ``emission`` the sums of colour and t under the weights."""
     float_type = type(path.width)
     uint = dr.uint32_array_t(float_type)

@@ -52,6 +52,7 @@ PLAN = (
     Task(9, "tests.benchmarks.quality --preset nerf --seconds 120"),
     Task(33, "tests.benchmarks.quality --preset nerf --seconds 600"),
     Task(4, "tests.benchmarks.startup", compares=True),
+    Task(12, "tests.benchmarks.frames", compares=True),
     Task(3, "tests.benchmarks.rendering --preset fast --seconds 60"),
     Task(3, "tests.benchmarks.rendering --preset nerf --seconds 60"),
     Task(4, "tests.benchmarks.reports speed"),

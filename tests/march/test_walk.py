@@ -259,7 +259,8 @@ def test_what_cannot_be_walked() -> None:
     for change in ({"rule": "linear"}, {"rule": "cells"}, {"hidden": 9.0}):
         assert not can_walk(MarchedField(field, replace(march, **change)))
     wide = replace(NARROW, network=replace(NARROW.network, width=65))
-    assert not can_walk(MarchedField(NeuralField.create(wide, 0, ad.TensorXf), march))
+    assert can_walk(MarchedField(NeuralField.create(wide, 0, ad.TensorXf), march))
+    assert not can_walk(MarchedField(AnalyticField(lambda p: p.x), march))
     coarse = NeuralField.create(NARROW, 0, ad.TensorXf, field)
     assert can_walk(MarchedField(coarse, march))
     assert not can_walk(MarchedField(coarse, replace(march, fine=8)))
