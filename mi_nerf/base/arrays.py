@@ -87,6 +87,11 @@ def _array(kind: str, float_type: type) -> Any:
     return getattr(sys.modules[float_type.__module__], kind + suffix)
 
 
+def taken(values: Any, index: Indices) -> Any:
+    """Entries of an array; one of a single value, which is the same for all, stays as it is."""
+    return values if len(values) == 1 else dr.gather(type(values), values, index)
+
+
 def gather_vector3(source: Vectors, index: Indices) -> Vectors:
     """Gathers the three components of ``source`` at ``index``, as an ``Array3``."""
     float_type = type(source[0])

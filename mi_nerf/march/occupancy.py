@@ -31,7 +31,7 @@ THRESHOLD = 0.01
 FAINTEST = 1e-4
 
 # The least density of a cell follows a smaller one at once, a larger one by this share a look.
-_FLOOR_RISE = 0.1
+_FLOOR_RISE = 0.3
 
 
 class OccupancyGrid:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import drjit as dr
 
-from ..base.arrays import Floats, Indices, Vectors
+from ..base.arrays import Floats, Indices, Vectors, gather_vector3, taken
 from ..cameras.ndc import NdcRays
 from .rules import RULES, CellRule
 
@@ -63,3 +63,45 @@ class Samples:
         kept = dr.arange(uint, min(queries, budget)) + dr.opaque(uint, 0)
         self.index = dr.gather(uint, self.index, kept)
         return dr.select(lost, first_lost // self.count, dr.opaque(uint, self.rays))
+
+
+def rays_with_samples(samples: Samples) -> tuple[Samples, Indices]:
+    """The samples of the rays that have any to ask for, and the ascending numbers of these rays.
+
+    Others see nothing, whatever the field is: most of those that pass an object by.
+    """
+    uint = type(samples.index)
+    asks = dr.zeros(uint, samples.rays)
+    dr.make_opaque(asks)
+    ray = samples.index // samples.count
+    dr.scatter(asks, uint(1), ray)
+    place = dr.cumsum(asks) - asks
+    numbers = uint(dr.compress(asks > 0))
+    index = samples.index - (ray - dr.gather(uint, place, ray)) * samples.count
+    lane = dr.arange(uint, len(numbers) * samples.count)
+    own = lane // samples.count
+    source = dr.gather(uint, numbers, own) * samples.count + (lane - own * samples.count)
+    kept = replace(
+        samples,
+        o=gather_vector3(samples.o, numbers),
+        d=gather_vector3(samples.d, numbers),
+        view=gather_vector3(samples.view, numbers),
+        t=dr.gather(type(samples.t), samples.t, source),
+        delta=dr.gather(type(samples.delta), samples.delta, source),
+        near=taken(samples.near, numbers),
+        far=taken(samples.far, numbers),
+        index=index,
+        ndc=None if samples.ndc is None else _ndc_rays(samples.ndc, numbers),
+    )
+    dr.eval(kept.o, kept.d, kept.view, kept.t, kept.delta, kept.near, kept.far, kept.index)
+    return kept, numbers
+
+
+def _ndc_rays(rays: NdcRays, numbers: Indices) -> NdcRays:
+    """Some of the rays in normalised device coordinates."""
+    vectors = ("o", "d")
+    values = {
+        f.name: (gather_vector3 if f.name in vectors else taken)(getattr(rays, f.name), numbers)
+        for f in fields(rays)
+    }
+    return NdcRays(**values)

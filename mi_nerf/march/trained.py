@@ -15,7 +15,7 @@ _EVERY, _START = 16, 256
 _QUERIES_PER_CELL = 128
 _DECAY = 0.9
 # Samples behind this optical depth of what has always been dense are left out of derivatives.
-HIDDEN = 10.0
+HIDDEN = 5.0
 
 
 class TrainedGrid(OccupancyGrid):

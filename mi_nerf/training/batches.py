@@ -8,7 +8,7 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..base.arrays import gather_vector3
+from ..base.arrays import gather_vector3, taken
 from ..base.kernel_stages import stage
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from ..data import Dataset, evenly_spread_indices
@@ -30,23 +30,26 @@ class RayBatch:
     alpha: Any
     background: list[Any]  # what to place behind both, one value or R values a channel
 
+    @property
+    def rays(self) -> int:
+        """R."""
+        return len(self.alpha)
+
     def part(self, start: int, rays: int) -> RayBatch:
         """``rays`` of the rays, from number ``start`` on."""
-        if rays == len(self.alpha):
+        if rays == self.rays:
             return self
         index = dr.arange(dr.uint32_array_t(type(self.alpha)), rays)
-        index += dr.opaque(type(index), start)
+        return self.at(index + dr.opaque(type(index), start))
 
-        def take(values: Any) -> Any:
-            one = len(values) == 1
-            return values if one else dr.gather(type(values), values, index)
-
+    def at(self, index: Any) -> RayBatch:
+        """The rays of these numbers."""
         part = RayBatch(
             gather_vector3(self.o, index),
             gather_vector3(self.d, index),
-            [take(c) for c in self.color],
-            take(self.alpha),
-            [take(c) for c in self.background],
+            [taken(c, index) for c in self.color],
+            taken(self.alpha, index),
+            [taken(c, index) for c in self.background],
         )
         with stage("rays"):
             dr.eval(part.o, part.d, part.color, part.alpha, part.background)

@@ -48,7 +48,7 @@ def fast() -> TrainConfig:
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
         occupancy=_OCCUPANCY,
-        sampling=replace(_SAMPLING, hidden=10.0),
+        sampling=replace(_SAMPLING, hidden=5.0),
         pyramid=_PYRAMID,
         optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, epsilon=1e-15),
     )

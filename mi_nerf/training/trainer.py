@@ -22,12 +22,12 @@ from ..march.placing import place_samples, refine
 from ..march.quadrature import Composite, integrate, over_background
 from ..march.query import Evaluation
 from ..march.render import render_rays
-from ..march.samples import Samples
+from ..march.samples import Samples, rays_with_samples
 from ..march.settings import MarchSettings
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
 from .loss_scale import LossScale
-from .losses import LOSSES, squared_error
+from .losses import LOSSES, mean_squared_error, squared_error
 from .model import carved_cells, field_config
 from .optimizer import Adam, JointParameters
 from .scaling import resolved
@@ -128,11 +128,11 @@ class Trainer:
         self.field_config = field_config(config, dataset)
         self._hull = carved_cells(config, dataset, self.field_config) if cells is None else cells
         _require_memory(config)
-        self.learn_from(dataset)
         loss = config.loss
         if loss == "auto":
             loss = "mse" if dataset.color_space == "srgb" else "relative"
         self._loss = LOSSES[loss]
+        self.learn_from(dataset)
         self.step_count = 0
         self.attempt = 0  # restarts after a collapse so far
         self.rays_per_step = 0.0
@@ -143,6 +143,7 @@ class Trainer:
         background = self.config.background
         if background == "auto":
             background = "random" if dataset.has_alpha else "white"
+        self._over_all_backgrounds = background == "random" and self._loss is squared_error
         self._noise_level = 0.0 if dataset.has_alpha else self.config.density.noise
         self.background = background
         self._source = RaySource(dataset, background, self._backend.Float, self.config.pyramid)
@@ -299,6 +300,10 @@ class Trainer:
             samples = place_samples(marched, batch.o, batch.d, jitter=drawn.jitter)
         wanted = samples.queries
         complete = samples.truncate(budget)
+        numbers = None
+        if field.coarse is None and samples.queries:
+            with stage("samples"):
+                samples, numbers = rays_with_samples(samples)
         queries, passes = samples.queries, []
         if field.coarse is not None:
             coarse = self._evaluate(field.coarse, samples)
@@ -313,7 +318,7 @@ class Trainer:
         evaluation = self._evaluate(field, samples)
         with stage("compositing"):
             passes.append((evaluation, integrate(evaluation, samples)))
-            errors = [self._errors(batch, seen, complete, share) for _, seen in passes]
+            errors = [self._errors(batch, seen, complete, share, numbers) for _, seen in passes]
             loss = sum((e for e, _ in errors), self._backend.Float(0))  # NeRF Eq. 6: of both
             dr.backward(loss)
             loss, mse = dr.detach(loss), errors[-1][1]
@@ -336,17 +341,39 @@ class Trainer:
         return evaluation
 
     def _errors(
-        self, batch: RayBatch, seen: Composite, complete: Any, share: float
+        self, batch: RayBatch, seen: Composite, complete: Any, share: float, numbers: Any
     ) -> tuple[Any, Any]:
-        """Loss and squared error of one network's image: ``share`` of the first rays' means."""
-        predicted = over_background(seen.color, seen.opacity, batch.background)
-        target = over_background(batch.color, batch.alpha, batch.background)
-        float_type = self._backend.Float
-        used = dr.arange(self._backend.UInt32, len(seen.opacity)) < complete
+        """Loss and squared error of one network's image: ``share`` of the first rays' means.
+
+        Args:
+            numbers: of the rays that ``seen`` has; the others saw nothing. None: it has all.
+        """
+        float_type, uint = self._backend.Float, self._backend.UInt32
         weight = dr.opaque(float_type, share) / float_type(dr.maximum(complete, 1))
-        loss = dr.sum(dr.select(used, self._loss(predicted, target), 0)) * weight
-        mse = dr.sum(dr.select(used, dr.detach(squared_error(predicted, target)), 0)) * weight
+        number = dr.arange(uint, batch.rays)
+        counts = number < complete
+        loss, mse = float_type(0), float_type(0)
+        if numbers is not None:
+            zero = float_type(0)
+            nothing = self._error_of_rays(batch, [zero, zero, zero], zero)
+            blank = dr.full(dr.mask_t(float_type), True, batch.rays)
+            dr.make_opaque(blank)
+            dr.scatter(blank, False, numbers)
+            loss, mse = (dr.sum(dr.select(counts & blank, e, 0)) * weight for e in nothing)
+            batch, counts = batch.at(numbers), numbers < complete
+        errors = self._error_of_rays(batch, seen.color, seen.opacity)
+        loss = loss + dr.sum(dr.select(counts, errors[0], 0)) * weight
+        mse = mse + dr.sum(dr.select(counts, dr.detach(errors[1]), 0)) * weight
         return loss, mse
+
+    def _error_of_rays(self, batch: RayBatch, color: list[Any], alpha: Any) -> tuple[Any, Any]:
+        """Loss and squared error of every ray that sees these premultiplied colours."""
+        if self._over_all_backgrounds:
+            error = mean_squared_error(color, alpha, batch.color, batch.alpha)
+            return error, error
+        predicted = over_background(color, alpha, batch.background)
+        target = over_background(batch.color, batch.alpha, batch.background)
+        return self._loss(predicted, target), squared_error(predicted, target)
 
     def _ray_count(self) -> int:
         """Rays of the next step, in coarse steps so that arrays are seldom resized."""

@@ -27,11 +27,13 @@ from mi_nerf.fields.neural import NeuralFieldConfig
 from mi_nerf.formats.field_file import load_field
 from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.placing import place_samples, refine
-from mi_nerf.march.quadrature import integrate, over_background
+from mi_nerf.march.quadrature import Composite, integrate, over_background
 from mi_nerf.march.query import Evaluation
 from mi_nerf.march.render import render_rays
+from mi_nerf.march.samples import rays_with_samples
 from mi_nerf.training import run as training
-from mi_nerf.training.batches import step_rng
+from mi_nerf.training import trainer as trainer_module
+from mi_nerf.training.batches import RayBatch, step_rng
 from mi_nerf.training.config import OptimizerConfig, TrainConfig, from_json, to_json, with_settings
 from mi_nerf.training.model import resolved_octaves
 from mi_nerf.training.plain import leaves
@@ -116,6 +118,18 @@ def test_backgrounds(views: Dataset, background: str) -> None:
     assert float(trainer.step(1e-2).loss[0]) == pytest.approx(expected, rel=error)
 
 
+def over_backgrounds(seen: Composite, batch: RayBatch) -> np.ndarray[Any, Any]:
+    """Squared error of every ray, mean over backgrounds in [0, 1], by a rule exact for it."""
+    errors = np.zeros(batch.rays)
+    for b, weight in zip((0.5 - 0.15**0.5, 0.5, 0.5 + 0.15**0.5), (5, 8, 5), strict=True):
+        behind = [ad.Float(b)] * 3
+        predicted = over_background(seen.color, seen.opacity, behind)
+        target = over_background(batch.color, batch.alpha, behind)
+        pairs = zip(predicted, target, strict=True)
+        errors += weight / 18 * sum(np.square(np.array(p - t)) for p, t in pairs) / 3
+    return errors
+
+
 def test_incomplete_rays_do_not_count(views: Dataset) -> None:
     """Rays that lost samples to the budget leave no trace in loss and gradient."""
     config = small("sampling.rays=64", "sampling.batch=100000", "occupancy.enabled=False")
@@ -133,9 +147,7 @@ def test_incomplete_rays_do_not_count(views: Dataset) -> None:
     complete = int(samples.truncate(700)[0])
     assert 0 < complete < 64
     seen = integrate(Evaluation(cut.field, samples, 1024), samples)
-    predicted = over_background(seen.color, seen.opacity, batch.background)
-    target = over_background(batch.color, batch.alpha, batch.background)
-    error = sum(np.square(np.array(p - t)) for p, t in zip(predicted, target, strict=True)) / 3
+    error = over_backgrounds(seen, batch)
     assert loss[1] == pytest.approx(error[:complete].mean(), rel=1e-5)
 
 
@@ -560,12 +572,7 @@ def test_the_loss_is_that_of_both_networks(views: Dataset) -> None:
     second = refine(first, seen[0].weights, 12, jitter=rng.random(ad.Float, 64 * 12))
     assert second.count == 24 and second.coarse_queries == first.queries
     seen.append(integrate(Evaluation(field, second, 1024), second))
-    target = over_background(batch.color, batch.alpha, batch.background)
-    errors = []
-    for image in seen:
-        predicted = over_background(image.color, image.opacity, batch.background)
-        pairs = zip(predicted, target, strict=True)
-        errors.append(np.mean(sum(np.square(np.array(p - t)) for p, t in pairs) / 3))
+    errors = [np.mean(over_backgrounds(image, batch)) for image in seen]
     result = trainer.step(1e-2)
     assert float(result.loss[0]) == pytest.approx(sum(errors), rel=1e-5)
     assert float(result.mse[0]) == pytest.approx(errors[1], rel=1e-5)
@@ -588,6 +595,26 @@ def test_sample_positions_are_detached(views: Dataset) -> None:
     for name, gradient in a.items():
         if name.startswith("coarse."):
             np.testing.assert_allclose(b[name], gradient, rtol=1e-4, atol=1e-8)
+
+
+def test_rays_that_meet_nothing_are_left_out_and_counted(
+    views: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Loss and gradients are those of all rays, of which some pass the hull by."""
+    found = []
+    for kept in (rays_with_samples, lambda samples: (samples, None)):
+        monkeypatch.setattr(trainer_module, "rays_with_samples", kept)
+        trainer = Trainer(small("sampling.rays=256", "sampling.batch=100000"), views, ad)
+        cells = trainer.occupancy
+        assert cells is not None and 0 < cells.fraction() < 0.9
+        part = trainer._differentiate(trainer._draw())
+        gradients = {n: np.array(dr.grad(t)) for n, t in trainer.parameters.items()}
+        found.append((float(part.loss[0]), float(part.mse[0]), gradients))
+    (loss, mse, some), (whole_loss, whole_mse, whole) = found
+    assert loss == pytest.approx(whole_loss, rel=1e-5)
+    assert mse == pytest.approx(whole_mse, rel=1e-5)
+    for name, gradient in whole.items():
+        np.testing.assert_allclose(some[name], gradient, rtol=1e-3, atol=1e-7)
 
 
 @pytest.mark.slow
