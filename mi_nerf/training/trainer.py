@@ -13,6 +13,7 @@ import numpy as np
 from ..base.errors import InputError
 from ..base.kernel_stages import stage
 from ..base.machine import available_memory
+from ..base.tensor_file import prefixed
 from ..data import Dataset
 from ..fields.neural import NeuralField
 from ..fields.protocol import Field
@@ -26,6 +27,7 @@ from ..march.samples import Samples
 from ..march.settings import MarchSettings
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
+from .growth import Snapshot, reshaped
 from .loss_scale import LossScale
 from .losses import LOSSES, squared_error
 from .model import carved_cells, field_config
@@ -152,19 +154,7 @@ class Trainer:
         tensors, coarse = self._backend.TensorXf, None
         if config.sampling.fine:
             coarse = NeuralField.create(self.field_config, seed + _COARSE_SEED, tensors)
-        self.field = NeuralField.create(self.field_config, seed, tensors, coarse)
-        groups = {"": self.field.parameters()}
-        if coarse is not None:
-            groups["coarse."] = coarse.parameters()
-        self.parameters = JointParameters(groups)
-        options = config.optimizer
-        self.optimizer = Adam(
-            self.parameters,
-            beta1=options.beta1,
-            beta2=options.beta2,
-            epsilon=options.epsilon,
-            muon=options.muon,
-        )
+        self._optimize(NeuralField.create(self.field_config, seed, tensors, coarse))
         self.loss_scale = LossScale(self._backend.Float) if config.half_precision else None
         self.occupancy = None
         if config.occupancy.enabled:
@@ -175,6 +165,72 @@ class Trainer:
         self.rays_per_step = float(
             sampling.rays or min(sampling.max_rays, max(1, sampling.batch // sampling.samples))
         )
+
+    def _optimize(self, field: NeuralField) -> None:
+        """Begins to optimise the parameters of a field."""
+        self.field = field
+        groups = {"": field.parameters()}
+        if field.coarse is not None:
+            groups["coarse."] = field.coarse.parameters()
+        self.parameters = JointParameters(groups)
+        options = self.config.optimizer
+        self.optimizer = Adam(
+            self.parameters,
+            beta1=options.beta1,
+            beta2=options.beta2,
+            epsilon=options.epsilon,
+            muon=options.muon,
+        )
+
+    def become(self, config: TrainConfig) -> None:
+        """Goes on with another configuration, from the present parameters and moments.
+
+        A larger model is the same function at first; see :mod:`mi_nerf.training.growth`.
+        Data, box, loss and precision stay as they are.
+
+        Raises:
+            ValueError: if layers would have to go, or could not start as the identity.
+        """
+        sight, seen = self.config.network.view_dependent, None
+        if sight and not config.network.view_dependent:
+            seen = self._mean_direction()
+        seed = config.seed + 1000 * self.attempt + self.step_count
+        self.go_on_from(reshaped(self.snapshot(), config, seed, seen))
+
+    def snapshot(self) -> Snapshot:
+        """The model as it is now, for :meth:`go_on_from`."""
+        return Snapshot(
+            self.config,
+            self.field_config,
+            {name: np.array(tensor) for name, tensor in self.parameters.items()},
+            self.optimizer.state(),
+            self._hull,
+            {} if self.occupancy is None else self.occupancy.state(),
+            self.rays_per_step,
+        )
+
+    def go_on_from(self, model: Snapshot) -> None:
+        """Takes up a model; the number of the step stays."""
+        self.config, self.field_config, self._hull = model.config, model.field, model.cells
+        tensors, coarse = self._backend.TensorXf, None
+        if model.config.sampling.fine:
+            coarse = NeuralField(model.field, prefixed(model.weights, "coarse."), tensors)
+        own = {n: a for n, a in model.weights.items() if not n.startswith("coarse.")}
+        self._optimize(NeuralField(model.field, own, tensors, coarse))
+        self.optimizer.restore(model.optimizer)
+        if self.occupancy is not None:
+            self.occupancy = OccupancyGrid(
+                self.field.lower, self.field.upper, model.cells, self._backend.Float
+            )
+            self.occupancy.restore(model.occupancy)
+        self.rays_per_step = model.rays
+
+    def _mean_direction(self) -> np.ndarray[Any, Any]:
+        """Features of directions, their mean over rays of the images."""
+        batch = self._source.draw(4096, step_rng(self._backend.Float, self.config.seed, 0))
+        with dr.suspend_grad():
+            features = self.field_config.direction.features(batch.d)
+            return np.array([float(dr.mean(f)[0]) for f in features], np.float32)
 
     def march_settings(self) -> MarchSettings:
         """How rays are sampled in training."""
