@@ -59,7 +59,9 @@ def reshaped(
     weights: dict[str, Array] = {}
     state = {n: a for n, a in old.optimizer.items() if "." not in n}
     for prefix in {"coarse." if n.startswith("coarse.") else "" for n in old.weights}:
-        own = {n: a for n, a in prefixed(old.weights, prefix).items() if prefix or "coarse." not in n}
+        own = {
+            n: a for n, a in prefixed(old.weights, prefix).items() if prefix or "coarse." not in n
+        }
         squares = prefixed(old.optimizer, f"second.{prefix}")
         found = shape.weights(own, seed + len(prefix), importance=squares, direction=direction)
         weights |= {f"{prefix}{n}": a for n, a in found.items()}

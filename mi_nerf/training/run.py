@@ -28,11 +28,22 @@ from ..formats.field_file import FieldFile, save_field
 from ..march.marched import MarchedField
 from ..march.settings import MarchSettings
 from ..march.view import View, display_image, render_view
-from .auto import Choice, Decision, choose
-from .checkpoint import Progress, load_checkpoint, save_checkpoint
-from .config import TrainConfig, to_json
+from .auto import Choice, Decision, choose, decisions_in
+from .checkpoint import Progress, load_checkpoint, read_checkpoint, save_checkpoint
+from .config import TrainConfig, from_json, to_json
+from .growing import Growing
+from .presets import preset
 from .progress import Meter, ProgressBar
-from .run_folder import CHECKPOINT, CONFIG, FIELD, FORMAT, LOG, cut_log, read_config
+from .run_folder import (
+    CHECKPOINT,
+    CONFIG,
+    FIELD,
+    FORMAT,
+    LOG,
+    cut_log,
+    read_config,
+    read_record,
+)
 from .schedule import learning_rate
 from .trainer import StepResult, Trainer
 
@@ -52,26 +63,26 @@ class Run:
         variant: str,
         *,
         started: float | None = None,
-        trainer: Trainer | None = None,
     ) -> None:
         """
         Args:
             started: the value of ``time.monotonic()`` from which seconds count; none: they
                 count while :meth:`reports` is at work.
-            trainer: of this configuration and dataset, to go on with if it has begun.
         """
         self.folder, self.config, self.variant = folder, config, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
         self.interrupted = False  # by Ctrl-C, when last trained
         self._started = started  # None: the clock stands still,
         self._paused = time.monotonic()  # since then
-        self.trainer = trainer or Trainer(config, dataset, array_module(variant))
+        self.trainer = Trainer(config, dataset, array_module(variant))
+        self._growing: Growing | None = None
+        self._record: dict[str, Any] = {}  # what config.json holds
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before the clock was last started
         self._skipped = 0
         self._skipped_in_row = self._without_rays = 0
         self._attempt_start = 0
-        self._begun = self.trainer.step_count  # before the log began
+        self._begun = 0  # steps before the log began
         self._since = Meter()
         # Squared errors of the last steps, as many as tell a collapse from bad luck.
         self._recent: deque[float] = deque(maxlen=max(1, min(100, config.collapse_check // 2)))
@@ -92,6 +103,18 @@ class Run:
         if self.config.max_seconds:
             shares.append(self.seconds / self.config.max_seconds)
         return min(1.0, max(shares))
+
+    def grow(self, dataset: Dataset, decisions: list[Decision]) -> None:
+        """Lets the model grow while it trains; ``decisions`` say why it is what it is so far."""
+        self.decisions = decisions
+        self._growing = Growing(
+            self.trainer, dataset, decisions, preset(self.config.preset), lambda: self.progress
+        )
+
+    def keep_record(self, record: dict[str, Any]) -> None:
+        """Writes ``config.json``, now and whenever the configuration has grown."""
+        self._record = record
+        write_json(self.folder / CONFIG, record)
 
     def resume(self) -> None:
         """Goes back to the checkpoint of the folder, and cuts the log to match."""
@@ -146,6 +169,8 @@ class Run:
                 self._advance()
                 if self._collapsed():
                     self._restart()
+                if self._growing is not None and self._growing.after_step():
+                    self._note_growth()
                 now = self.seconds
                 self.interrupted = bool(stop)
                 finished = self.progress >= 1 or self.interrupted
@@ -193,6 +218,9 @@ class Run:
         progress = Progress(self.seconds, self._skipped, self._attempt_start, self._begun)
         save_checkpoint(self.folder / CHECKPOINT, self.trainer, progress)
         save_field(self.folder / FIELD, self.field_file())
+        if self._growing is not None and self._record:
+            # Last: a checkpoint that has grown more counts, see _resumed_config.
+            self.keep_record(self._grown_record())
 
     def field_file(self) -> FieldFile:
         """The field as it is now, as XML scenes will load it."""
@@ -296,6 +324,28 @@ class Run:
                 f"{self.trainer.step_count}; try a larger sampling.batch or fewer sampling.rays"
             )
 
+    # ----------------------------------- Growth -----------------------------------
+
+    def _note_growth(self) -> None:
+        """Goes on with the configuration that the trainer has by now."""
+        config, budget = self.trainer.config, self.config
+        self.config = replace(config, steps=budget.steps, max_seconds=budget.max_seconds)
+        self._blank = self.trainer.blank_loss
+
+    def _grown_record(self) -> dict[str, Any]:
+        """What ``config.json`` holds by now; its budget stays what the run began with."""
+        budget = {n: self._record["settings"].get(n) for n in ("steps", "max_seconds")}
+        field = {
+            **self._record["field"],
+            "parameters": self.trainer.field_config.parameter_count(),
+        }
+        return {
+            **self._record,
+            "settings": {**to_json(self.config), **budget},
+            "field": field,
+            "auto": [asdict(decision) for decision in self.decisions],
+        }
+
     # ---------------------------------- Collapse ----------------------------------
 
     def _collapsed(self) -> bool:
@@ -356,9 +406,9 @@ def start(
 
     With ``resume`` the folder's own configuration holds; only ``steps`` and
     ``max_seconds`` of ``config`` take its place, where given. Seconds count from ``started``,
-    or else while this function and :meth:`Run.reports` are at work. A new run with preset
-    ``auto`` first chooses its model, within its time but besides its steps; settings
-    named in ``given`` or unlike the preset's are kept.
+    or else while this function and :meth:`Run.reports` are at work. A run with preset
+    ``auto`` chooses its model, in part while it trains; settings named in ``given`` or unlike
+    the preset's are kept.
 
     Raises:
         InputError: if the folder already holds a run, or the data cannot be read.
@@ -376,16 +426,24 @@ def start(
     check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
     choice = Choice(config, [])
-    if config.preset == "auto" and not recorded:
-        choice = choose(config, dataset, array_module(variant), given=given)
-    run = Run(folder, choice.config, dataset, variant, started=clock, trainer=choice.trainer)
-    run.decisions = choice.decisions
+    if config.preset == "auto":
+        choice = (
+            Choice(config, decisions_in(read_record(folder), config))
+            if recorded
+            else choose(config, dataset, given=given)
+        )
+    run = Run(folder, choice.config, dataset, variant, started=clock)
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
         run.resume()
     else:
         (folder / LOG).unlink(missing_ok=True)
-        write_json(folder / CONFIG, _record(run, dataset))
+    if choice.decisions:
+        run.grow(dataset, choice.decisions)
+    if recorded:
+        run.keep_record(read_record(folder))
+    else:
+        run.keep_record(_record(run, dataset))
     if started is None:
         run.pause()
     return run
@@ -396,6 +454,12 @@ def _resumed_config(folder: Path, given: TrainConfig, data: str | Path) -> Train
     recorded = record["data"]["path"]
     if Path(recorded) != Path(data).resolve():
         raise InputError(f"{data}: expected {recorded}, on which the run in {folder} was trained")
+    if config.preset == "auto" and (folder / CHECKPOINT).exists():
+        # It may have grown after config.json was last written.
+        _, description = read_checkpoint(folder / CHECKPOINT)
+        if description.settings is not None:
+            grown = from_json(description.settings, str(folder / CHECKPOINT))
+            config = replace(grown, steps=config.steps, max_seconds=config.max_seconds)
     if given.steps is not None or given.max_seconds is not None:
         config = replace(config, steps=given.steps, max_seconds=given.max_seconds)
     return config

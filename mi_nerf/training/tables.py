@@ -41,7 +41,9 @@ class Level:
         """The entries of vertices, counted from the beginning of the level."""
         if self.dense:
             return np.asarray((x + self.side * (y + self.side * z)) % self.entries)
-        parts = [v.astype(np.uint64) * np.uint64(p) for v, p in zip((x, y, z), _PRIMES, strict=True)]
+        parts = [
+            v.astype(np.uint64) * np.uint64(p) for v, p in zip((x, y, z), _PRIMES, strict=True)
+        ]
         mixed = (parts[0] ^ parts[1] ^ parts[2]) & np.uint64(0xFFFFFFFF)
         return np.asarray((mixed % np.uint64(self.entries)).astype(np.int64))
 

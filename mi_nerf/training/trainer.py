@@ -191,11 +191,15 @@ class Trainer:
         Raises:
             ValueError: if layers would have to go, or could not start as the identity.
         """
-        sight, seen = self.config.network.view_dependent, None
-        if sight and not config.network.view_dependent:
+        self.go_on_from(self.in_shape_of(config))
+
+    def in_shape_of(self, config: TrainConfig) -> Snapshot:
+        """The model that :meth:`become` would go on with; changes nothing."""
+        seen = None
+        if self.config.network.view_dependent and not config.network.view_dependent:
             seen = self._mean_direction()
         seed = config.seed + 1000 * self.attempt + self.step_count
-        self.go_on_from(reshaped(self.snapshot(), config, seed, seen))
+        return reshaped(self.snapshot(), config, seed, seen)
 
     def snapshot(self) -> Snapshot:
         """The model as it is now, for :meth:`go_on_from`."""
@@ -252,9 +256,16 @@ class Trainer:
         self._adapt_rays(drawn.rays, found.wanted)
         return StepResult(found.loss, found.mse, accepted, found.rays, found.queries)
 
-    def validate(self, batch: RayBatch, field: Field | None = None) -> float:
-        """The loss over the pixels of ``batch``, by this field or another; changes nothing."""
+    def validate(
+        self, batch: RayBatch, field: Field | None = None, *, samples: int | None = None
+    ) -> float:
+        """The loss over the pixels of ``batch``, by this field or another; changes nothing.
+
+        Args:
+            samples: strata a ray; none: as in training.
+        """
         march = replace(self.march_settings(), hidden=0.0, fine=self.config.sampling.fine)
+        march = replace(march, samples=samples or march.samples)
         with dr.suspend_grad():
             seen = render_rays(
                 MarchedField(field or self.field, march, self.occupancy), batch.o, batch.d

@@ -1,0 +1,121 @@
+"""Views held back from training: what preset ``auto`` judges a model by."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import drjit as dr
+import numpy as np
+
+from ..base.arrays import vector3_type
+from ..data import Dataset
+from ..fields.neural import NeuralField
+from ..fields.protocol import Field
+from .batches import RaySource, step_rng
+from .config import TrainConfig
+from .trainer import Trainer
+
+FEWEST_VIEWS = 5  # with fewer there is none to hold back
+_MOST_VIEWS = 8  # to hold back
+_PIXELS = 8192  # held-back ones that judge a field, at most
+_DIRECTIONS = 8  # from which light is averaged
+_EVEN_PIXELS = 4096  # for that, at most
+_SEED = 77  # of the choice of pixels, always the same
+
+
+class HeldBack:
+    """Some views of a dataset, and the quality of a field in pixels of theirs."""
+
+    def __init__(self, dataset: Dataset, trainer: Trainer) -> None:
+        """
+        Args:
+            trainer: whose field is judged; it still learns from all views of ``dataset``.
+        """
+        count = min(_MOST_VIEWS, max(1, len(dataset) // FEWEST_VIEWS))
+        held = [(2 * i + 1) * len(dataset) // (2 * count) for i in range(count)]
+        self._all, self._trainer, self.holds = dataset, trainer, False
+        self.views = dataset.subset(held)
+        self.others = dataset.subset([i for i in range(len(dataset)) if i not in held])
+        float_type = type(next(iter(trainer.parameters.values())).array)
+        source = RaySource(self.views, trainer.background, float_type)
+        size = dataset.intrinsics
+        most = count * size.width * size.height
+        self._pixels, self._few = (
+            source.draw(min(n, most), step_rng(float_type, _SEED, 0))
+            for n in (_PIXELS, _EVEN_PIXELS)
+        )
+
+    def hold(self) -> None:
+        """Takes the views away from the trainer."""
+        self._trainer.learn_from(self.others)
+        self.holds = True
+
+    def give_back(self) -> None:
+        """Lets the trainer learn from all views again."""
+        self._trainer.learn_from(self._all)
+        self.holds = False
+
+    def quality(self, *, samples: int | None = None) -> float:
+        """Of the trainer's field, dB: −10 log10 of the loss.
+
+        Args:
+            samples: strata a ray; none: as in training.
+        """
+        return _decibels(self._trainer.validate(self._pixels, samples=samples))
+
+    def lost_as(self, config: TrainConfig) -> float:
+        """What the trained field would lose at once in the shape of another configuration, dB."""
+        trainer = self._trainer
+        model = trainer.in_shape_of(config)
+        weights = {n: w for n, w in model.weights.items() if not n.startswith("coarse.")}
+        tensors = type(next(iter(trainer.parameters.values())))
+        field = NeuralField(model.field, weights, tensors, trainer.field.coarse)
+        return self.quality() - _decibels(trainer.validate(self._pixels, field))
+
+    def lost_even(self) -> float:
+        """What the trained field loses if it sends the same light in all directions, dB."""
+        trainer, field = self._trainer, self._trainer.field
+        config, network = trainer.config, trainer.config.network
+        if not network.view_dependent:
+            return 0.0
+        if field.ndc is not None:  # where cameras have no place among positions
+            blind = dataclasses.replace(network, view_dependent=False)
+            return self.lost_as(dataclasses.replace(config, network=blind))
+        cameras = self.others.evenly_spread(_DIRECTIONS).cam_to_world[:, :3, 3]
+        even = trainer.validate(self._few, _EvenLight(field, cameras))
+        return _decibels(trainer.validate(self._few)) - _decibels(even)
+
+
+class _EvenLight(Field):
+    """A field whose emission is averaged over directions from which cameras see it."""
+
+    def __init__(self, field: NeuralField, cameras: np.ndarray[Any, Any]) -> None:
+        self._field, self._cameras = field, cameras
+        self.lower, self.upper = field.lower, field.upper
+        self.color_space, self.ndc = field.color_space, field.ndc
+
+    def density(self, p: Any) -> Any:
+        return self._field.density(p)
+
+    def parameters(self) -> dict[str, Any]:
+        return self._field.parameters()
+
+    def density_emission(self, p: Any, d: Any) -> tuple[Any, list[Any]]:
+        """Cameras on the other side of a surface do not know what it looks like: their
+        say is the smaller, the more their direction differs from ``d``."""
+        vector, total = vector3_type(type(p[0])), 0
+        density, colors = None, [0, 0, 0]
+        for camera in self._cameras:
+            towards = dr.normalize(p - vector(*(float(x) for x in camera)))
+            density, color = self._field.density_emission(p, towards)
+            weight = dr.fmax(dr.dot(towards, d), 0) + 1e-3
+            total = total + weight
+            colors = [c + weight * new for c, new in zip(colors, color, strict=True)]
+            dr.eval(density, colors, total)
+        return density, [c / total for c in colors]
+
+
+def _decibels(loss: float) -> float:
+    return -10 * math.log10(max(loss, 1e-12)) if math.isfinite(loss) else math.nan
