@@ -26,7 +26,7 @@ from .presets import preset
 SHORTEST_SECONDS = 55.0  # of a run that has time to ask questions
 SHORTEST_STEPS = 900  # likewise
 SMALL = "to begin with"  # how reasons begin of what may still grow
-_SMALLER_TABLE = 2  # of the logarithm of its entries, to begin with
+SMALLER_TABLE = 2  # of the logarithm of its entries, to begin with
 _FEWEST_OCTAVES = 4  # of Fourier features, to begin with
 _MEMORY_SHARE = 0.125  # of the machine's, for what one step keeps
 _BYTES_PER_QUERY = 8192  # activations, their gradients, samples: generous for a narrow network
@@ -210,7 +210,7 @@ def _settle_beginning(choice: _Settings, views: int) -> None:
         if not hurry:
             choice.take("network.view_depth", 0, "without directions, no layers behind them")
     if grid is not None and choice.open("grid"):
-        less = 0 if hurry else _SMALLER_TABLE
+        less = 0 if hurry else SMALLER_TABLE
         why = f"as in preset fast: {hurry}" if hurry else f"{SMALL}, a quarter of preset fast's"
         choice.take("grid.log2_entries", grid.log2_entries - less, why)
     position = config.position

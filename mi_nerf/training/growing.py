@@ -21,9 +21,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ..data import Dataset
-from .auto import Decision, may_grow, record
-from .config import TrainConfig, with_settings
+from .auto import SMALLER_TABLE, Decision, may_grow, record
+from .config import with_settings
 from .held_back import HeldBack
+from .model import resolved_octaves
+from .plain import as_text
 from .trainer import Trainer
 
 TOLERANCE = 0.1  # dB: what brings less is not kept
@@ -39,6 +41,7 @@ GROWN = 0.4  # share of the budget after which nothing is added
 LAST = 0.96  # share of the budget after which strata are counted
 _DEEPER_STEPS = 4000  # steps that a run must have time for to try another layer
 _OCTAVES = 2  # added at a time
+_PACED = (5, 15)  # steps that wait for the compiler, and that show what a step takes
 
 
 class Growing:
@@ -49,7 +52,6 @@ class Growing:
         trainer: Trainer,
         dataset: Dataset,
         decisions: list[Decision],
-        usual: TrainConfig,
         progress: Callable[[], float],
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
@@ -57,13 +59,12 @@ class Growing:
         Args:
             dataset: what the trainer learns from; views of it are held back at first.
             decisions: what has been decided so far; kept up to date.
-            usual: the preset's configuration, for the sizes that it grows to.
             progress: the share of the budget that is spent.
             clock: seconds, by which steps are timed.
         """
-        self._trainer, self._decisions, self._usual = trainer, decisions, usual
+        self._trainer, self._dataset, self._decisions = trainer, dataset, decisions
         self._progress, self._clock = progress, clock
-        self._begun = self._seen_step = trainer.step_count
+        self._begun, self._pace = trainer.step_count, 0.0  # share of the budget for a step
         self._attempt = trainer.attempt
         self._held = HeldBack(dataset, trainer)
         if self._asks() and progress() < GROWN:
@@ -89,9 +90,13 @@ class Growing:
         """Advanced once after every step."""
         held = self._held
         if held.holds:
-            yield from self._pass(FIRST, FIRST_STEPS)
-            for ask in (self._directions, self._entries, self._octaves, self._depth):
-                yield from ask(held)
+            yield from self._measure_pace()
+            if self._progress() + self._pace * (FIRST_STEPS + 2 * TRIAL_STEPS) > GROWN:
+                self._hurry()
+            else:
+                yield from self._pass(FIRST, FIRST_STEPS - sum(_PACED))
+                for ask in (self._directions, self._entries, self._octaves, self._depth):
+                    yield from ask(held)
             held.give_back()
             yield
         while self._progress() < LAST:
@@ -104,11 +109,33 @@ class Growing:
         while self._progress() < start + share or self._trainer.step_count < first + steps:
             yield
 
-    def _time_left(self, shares: float = TRIAL) -> bool:
-        """Whether a trial would end before growth has to."""
-        taken = self._trainer.step_count - self._begun
-        pace = self._progress() / max(taken, 1)
-        return self._progress() + max(shares, TRIAL_STEPS * pace) <= GROWN
+    def _measure_pace(self) -> Iterator[None]:
+        """Takes a few steps; the first ones are left out, which wait for the compiler."""
+        yield from self._pass(0, _PACED[0])
+        before = self._progress()
+        yield from self._pass(0, _PACED[1])
+        self._pace = (self._progress() - before) / _PACED[1]
+
+    def _time_left(self, trials: int = 1) -> bool:
+        """Whether so many trials would end before growth has to."""
+        return self._progress() + trials * max(TRIAL, TRIAL_STEPS * self._pace) <= GROWN
+
+    def _hurry(self) -> None:
+        """The sizes of preset ``fast``, at once."""
+        config, why = self._trainer.config, "as in preset fast: too few steps to ask what else"
+        usual = {"network.view_dependent": True, "network.view_depth": 1, "network.depth": 1}
+        if config.grid is not None:
+            usual["grid.log2_entries"] = config.grid.log2_entries + SMALLER_TABLE
+        else:
+            field = self._trainer.field_config
+            octaves = resolved_octaves(self._dataset, field.lower, field.upper)
+            usual["position.frequencies"] = octaves
+        open_now = {n: v for n, v in usual.items() if may_grow(self._decisions, n)}
+        if "network.view_dependent" not in open_now:
+            open_now.pop("network.view_depth", None)
+        self._become(*(f"{name}={as_text(value)}" for name, value in open_now.items()))
+        for name, value in open_now.items():
+            self._say(name, value, why)
 
     def _say(self, setting: str, value: Any, reason: str) -> None:
         record(self._decisions, Decision(setting, value, reason))
@@ -144,8 +171,7 @@ class Growing:
         name, grid = "grid.log2_entries", self._trainer.config.grid
         if grid is None or not may_grow(self._decisions, name):
             return
-        assert self._usual.grid is not None
-        entries, most, said = grid.log2_entries, self._usual.grid.log2_entries, ""
+        entries, most, said = grid.log2_entries, grid.log2_entries + SMALLER_TABLE, ""
         while entries < most and self._time_left():
             entries += 1
             self._become(f"{name}={entries}")
@@ -183,22 +209,17 @@ class Growing:
         name, trainer = "network.depth", self._trainer
         if not may_grow(self._decisions, name) or trainer.config.network.depth != 1:
             return
-        taken, spent = trainer.step_count - self._begun, self._progress()
-        if taken / max(spent, 1e-9) < _DEEPER_STEPS or not self._time_left(3 * TRIAL):
+        if _DEEPER_STEPS * self._pace > 1 or not self._time_left(2):
             self._say(name, 1, "as in preset fast: no time for a trial of a second layer")
             return
-        quality, start = held.quality(), self._clock()
+        earlier, start = held.quality(), self._clock()
         yield from self._pass(TRIAL, TRIAL_STEPS)
-        before, earlier, quality = trainer.snapshot(), quality, held.quality()
-        # Quality grows about as the logarithm of the steps: as far in the next stretch as
-        # this one has shown, or less.
-        slope = max(0.0, quality - earlier)
-        pace = self._clock() - start
+        before, quality, between = trainer.snapshot(), held.quality(), self._clock()
         self._become(f"{name}=2")
         yield from self._pass(TRIAL, TRIAL_STEPS)
-        gain = held.quality() - quality
-        seconds = self._clock() - start - pace
-        rivals = slope * seconds / max(pace, 1e-9)
+        gain, slope = held.quality() - quality, max(0.0, quality - earlier)
+        # In the time that this took, the smaller network would have gained no more than before.
+        rivals = slope * (self._clock() - between) / max(between - start, 1e-9)
         why = f"a second layer gained {gain:.2f} dB, where one had gained {slope:.2f} just before"
         if gain > rivals + TOLERANCE:
             self._say(name, 2, f"added: {why}")

@@ -32,7 +32,6 @@ from .auto import Choice, Decision, choose, decisions_in
 from .checkpoint import Progress, load_checkpoint, read_checkpoint, save_checkpoint
 from .config import TrainConfig, from_json, to_json
 from .growing import Growing
-from .presets import preset
 from .progress import Meter, ProgressBar
 from .run_folder import (
     CHECKPOINT,
@@ -107,9 +106,7 @@ class Run:
     def grow(self, dataset: Dataset, decisions: list[Decision]) -> None:
         """Lets the model grow while it trains; ``decisions`` say why it is what it is so far."""
         self.decisions = decisions
-        self._growing = Growing(
-            self.trainer, dataset, decisions, preset(self.config.preset), lambda: self.progress
-        )
+        self._growing = Growing(self.trainer, dataset, decisions, lambda: self.progress)
 
     def keep_record(self, record: dict[str, Any]) -> None:
         """Writes ``config.json``, now and whenever the configuration has grown."""
