@@ -151,6 +151,23 @@ def test_directions_stay_where_their_mean_would_not_do(
     assert grown(config, decisions).config.network.view_dependent == needed
 
 
+def test_directions_that_take_time_have_to_bring_more(script: Script) -> None:
+    """A step that takes 1.3 times as long costs log2 1.3 = 0.38 dB."""
+    for even, needed in ((0.37, False), (0.39, True)):
+        script.even = even
+        config, decisions = begun()
+        trainer, seconds = FakeTrainer(config), [0.0]
+        policy = Growing(
+            trainer, None, decisions, lambda t=trainer: t.step_count / 10000, lambda s=seconds: s[0]
+        )
+        for _ in range(9000):
+            seconds[0] += 0.013 if trainer.config.network.view_dependent else 0.01
+            trainer.step_count += 1
+            policy.after_step()
+        assert trainer.config.network.view_dependent == needed
+        assert "1.30 times as long, worth 0.38" in reason(decisions, "network.view_dependent")
+
+
 @pytest.mark.parametrize(("enough", "ends"), [(14, 14), (15, 15), (20, 16)])
 def test_tables_double_as_long_as_they_need_to(script: Script, enough: int, ends: int) -> None:
     script.lost = lambda config: 0.0 if config.grid.log2_entries >= enough else 0.5
