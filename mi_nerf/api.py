@@ -123,8 +123,8 @@ def start(
     Args:
         data: folder of a dataset.
         out: folder of the run; created.
-        preset: ``nerf``, ``fast``, ``paper``, or ``auto``, which now begins to train
-            several models.
+        preset: ``nerf``, ``fast``, ``paper``, or ``auto``, whose model grows while it
+            trains.
         max_seconds, steps: the budget, wall-clock seconds of training or steps; 600 seconds if
             neither is given.
         downscale: average images over blocks of so many pixels squared.
