@@ -62,18 +62,20 @@ class Run:
         variant: str,
         *,
         started: float | None = None,
+        trainer: Trainer | None = None,
     ) -> None:
         """
         Args:
             started: the value of ``time.monotonic()`` from which seconds count; none: they
                 count while :meth:`reports` is at work.
+            trainer: of this configuration and dataset, in place of a new one.
         """
         self.folder, self.config, self.variant = folder, config, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
         self.interrupted = False  # by Ctrl-C, when last trained
         self._started = started  # None: the clock stands still,
         self._paused = time.monotonic()  # since then
-        self.trainer = Trainer(config, dataset, array_module(variant))
+        self.trainer = trainer or Trainer(config, dataset, array_module(variant))
         self._growing: Growing | None = None
         self._record: dict[str, Any] = {}  # what config.json holds
         self._blank = self.trainer.blank_loss
