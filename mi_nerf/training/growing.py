@@ -156,8 +156,12 @@ class Growing:
     def _directions(self, held: HeldBack) -> Iterator[None]:
         """Added, and taken out again if their mean would do."""
         name, trainer = "network.view_dependent", self._trainer
-        if not may_grow(self._decisions, name) or trainer.config.network.view_dependent:
+        if not may_grow(self._decisions, name):
             return
+        if trainer.config.network.view_dependent:
+            self._say(name, True, "added before training began again")
+            return
+        begun = trainer.step_count
         before, quality, plain = trainer.snapshot(), held.quality(), self._step_seconds
         self._become(f"{name}=true", "network.view_depth=1")
         yield from self._time_steps()
@@ -166,10 +170,10 @@ class Growing:
         lost, allowed = held.lost_even(), _DOUBLE * math.log2(max(slower, 1))
         allowed = min(max(allowed, MOST_LOST[0]), MOST_LOST[1])
         why = (
-            f"views held back had {quality:.2f} dB without them; with them, after "
-            f"{self._percent(TRIAL)} of the budget, {held.quality():.2f}, of which light averaged "
-            f"over directions would lose {lost:.2f}; steps take {slower:.2f} times as long, "
-            f"worth {allowed:.2f}"
+            f"views held back had {quality:.2f} dB without them; with them, "
+            f"{trainer.step_count - begun} steps later, {held.quality():.2f}, of which light "
+            f"averaged over directions would lose {lost:.2f}; steps take {slower:.2f} times as "
+            f"long, worth {allowed:.2f}"
         )
         if lost > allowed:
             self._say(name, True, f"added: {why}")
@@ -262,7 +266,3 @@ class Growing:
 
     def _lost(self, held: HeldBack, setting: str) -> float:
         return held.lost_as(with_settings(self._trainer.config, [setting]))
-
-    @staticmethod
-    def _percent(share: float) -> str:
-        return f"{100 * share:.0f} %"
