@@ -177,6 +177,15 @@ def test_tables_double_as_long_as_they_need_to(script: Script, enough: int, ends
     assert len({c.grid.log2_entries for _, c in trainer.history}) == min(ends + 1, 16) - 13
 
 
+@pytest.mark.parametrize(("even", "ends"), [(1.0, 16), (0.0, 14)])
+def test_a_model_with_directions_needs_its_entries_more(
+    script: Script, even: float, ends: int
+) -> None:
+    script.even, script.lost = even, lambda config: 0.05
+    config, decisions = begun()
+    assert grown(config, decisions).config.grid.log2_entries == ends
+
+
 def test_octaves_of_fourier_features(script: Script) -> None:
     """L where two octaves more bring nothing; without a hash grid alone."""
     script.lost = lambda config: 0.0 if config.position.frequencies >= 8 else 0.3
