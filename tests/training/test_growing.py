@@ -133,39 +133,25 @@ def test_everything_is_added_that_is_needed(script: Script) -> None:
 
 
 def test_nothing_is_added_to_what_needs_nothing(script: Script) -> None:
-    script.even, script.lost = 0.1, lambda config: 0.05
+    script.even, script.lost = 0.1, lambda config: 0.01
     config, decisions = begun()
     trainer = grown(config, decisions)
-    assert with_settings(trainer.config, ["sampling.render_samples=128"]) == config
+    assert (
+        with_settings(trainer.config, ["sampling.render_samples=128", "network.view_depth=0"])
+        == config
+    )
     assert "taken out again" in reason(decisions, "network.view_dependent")
     assert "0.10" in reason(decisions, "network.view_dependent")
-    assert "2^15 halved again would lose 0.05 dB" in reason(decisions, "grid.log2_entries")
+    assert "2^15 halved again would lose 0.01 dB" in reason(decisions, "grid.log2_entries")
 
 
 @pytest.mark.parametrize(("even", "needed"), [(0.19, False), (0.21, True)])
 def test_directions_stay_where_their_mean_would_not_do(
     script: Script, even: float, needed: bool
 ) -> None:
-    script.even = even
+    script.even, script.lost = even, lambda config: 0.01
     config, decisions = begun()
     assert grown(config, decisions).config.network.view_dependent == needed
-
-
-def test_directions_that_take_time_have_to_bring_more(script: Script) -> None:
-    """A step that takes 1.3 times as long costs log2 1.3 = 0.38 dB."""
-    for even, needed in ((0.37, False), (0.39, True)):
-        script.even = even
-        config, decisions = begun()
-        trainer, seconds = FakeTrainer(config), [0.0]
-        policy = Growing(
-            trainer, None, decisions, lambda t=trainer: t.step_count / 10000, lambda s=seconds: s[0]
-        )
-        for _ in range(9000):
-            seconds[0] += 0.013 if trainer.config.network.view_dependent else 0.01
-            trainer.step_count += 1
-            policy.after_step()
-        assert trainer.config.network.view_dependent == needed
-        assert "1.30 times as long, worth 0.38" in reason(decisions, "network.view_dependent")
 
 
 @pytest.mark.parametrize(("enough", "ends"), [(14, 14), (15, 15), (20, 16)])
@@ -175,15 +161,6 @@ def test_tables_double_as_long_as_they_need_to(script: Script, enough: int, ends
     trainer = grown(config, decisions)
     assert trainer.config.grid.log2_entries == ends
     assert len({c.grid.log2_entries for _, c in trainer.history}) == min(ends + 1, 16) - 13
-
-
-@pytest.mark.parametrize(("even", "ends"), [(1.0, 16), (0.0, 14)])
-def test_a_model_with_directions_needs_its_entries_more(
-    script: Script, even: float, ends: int
-) -> None:
-    script.even, script.lost = even, lambda config: 0.05
-    config, decisions = begun()
-    assert grown(config, decisions).config.grid.log2_entries == ends
 
 
 def test_octaves_of_fourier_features(script: Script) -> None:
