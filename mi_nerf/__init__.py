@@ -24,22 +24,26 @@ from ._version import __version__ as __version__
 ensure_llvm()  # before Dr.Jit looks for its compiler
 
 from .base.errors import InputError  # noqa: E402
+from .base.work_items import LANES, set_work_item  # noqa: E402
 from .fields.neural import NeuralField, NeuralFieldConfig  # noqa: E402
 from .fields.protocol import Field  # noqa: E402
 from .formats.field_file import FieldFile, load_field, save_field  # noqa: E402
 from .plugins import register_always  # noqa: E402
 
 if TYPE_CHECKING:
-    from .api import describe, evaluate, generate, pictures, render, start
+    from .api import generate, pictures, render, start
     from .base.variants import available_variants, choose_variant
     from .data import Dataset, load_dataset
     from .images.metrics import psnr, ssim
     from .images.write import on_white, write_picture
     from .scene_xml.library import find_scene, scenes
+    from .tasks.describe import describe
+    from .tasks.evaluate import evaluate
     from .tasks.target import Target, open_target
     from .training.config import TrainConfig, setting_names
     from .training.run import Run, TrainingError
 
+set_work_item(LANES)
 register_always()
 
 # Imported when first asked for: XML scenes need none of it.
@@ -49,10 +53,12 @@ _LATER = {
     "images.metrics": ("psnr", "ssim"),
     "images.write": ("on_white", "write_picture"),
     "scene_xml.library": ("find_scene", "scenes"),
+    "tasks.describe": ("describe",),
+    "tasks.evaluate": ("evaluate",),
     "tasks.target": ("Target", "open_target"),
     "training.config": ("TrainConfig", "setting_names"),
     "training.run": ("Run", "TrainingError"),
-    "api": ("describe", "evaluate", "generate", "pictures", "render", "start"),
+    "api": ("generate", "pictures", "render", "start"),
 }
 
 __all__ = [

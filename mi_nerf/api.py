@@ -10,28 +10,27 @@ from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from . import generation
 from .base.arrays import Image
 from .base.checks import positive, valid_seed
 from .base.errors import InputError, Option
 from .base.progress_bar import progress_bar
 from .base.variants import active_variant
 from .data import Dataset
-from .scene_xml.library import find_scene
-from .tasks import render as rendering
-from .tasks.describe import describe
-from .tasks.evaluate import evaluate, reference_image
-from .tasks.target import Target
 from .training import run as training
 from .training.config import TrainConfig, with_settings
+from .training.forecast import PUBLISHED_STEPS
 from .training.plain import as_text
 from .training.presets import preset as preset_config
 from .training.run import Run
 from .training.run_folder import CONFIG, read_config
 
-__all__ = ["describe", "evaluate", "generate", "pictures", "render", "start"]
+if TYPE_CHECKING:
+    from .tasks.target import Target
+
+# Training begins sooner without what only the other functions need: they import it themselves.
+__all__ = ["generate", "pictures", "render", "start"]
 
 Settings = Mapping[str, Any] | Sequence[str]
 
@@ -78,6 +77,9 @@ def generate(
     Raises:
         InputError: if anything is not as expected; existing files are as they were.
     """
+    from . import generation
+    from .scene_xml.library import find_scene
+
     valid_seed(seed)
     options = generation.Options(
         protocol=protocol,
@@ -123,10 +125,11 @@ def start(
     Args:
         data: folder of a dataset.
         out: folder of the run; created.
-        preset: ``nerf``, ``fast``, ``paper``, or ``auto``, whose model grows while it
+        preset: ``nerf``, ``fast``, ``paper``, or ``auto``, which takes shape while it
             trains.
-        max_seconds, steps: the budget, wall-clock seconds of training or steps; 600 seconds if
-            neither is given.
+        max_seconds, steps: the budget, wall-clock seconds of training or steps, which the
+            learning rate follows. If neither is given: 600 seconds; with ``paper`` its
+            200,000 steps, if they take less than a day. ``run.forecast`` says what they would.
         downscale: average images over blocks of so many pixels squared.
         seed: of initial weights, rays and samples.
         settings: any other setting by its name, ``{"network.width": 128}``, or as ``--set``
@@ -136,8 +139,8 @@ def start(
             while this function and training are at work.
 
     Raises:
-        InputError: if the folder already holds a run, the data cannot be read, or a setting
-            is unknown or out of range.
+        InputError: if the folder already holds a run, the data cannot be read, a setting is
+            unknown or out of range, or ``paper`` would take days and has no budget.
     """
     assignments = _assignments(settings)
     config = replace(
@@ -147,9 +150,11 @@ def start(
     for name, value in (("steps", steps), ("max_seconds", max_seconds)):
         if value is not None:
             config = replace(config, **{name: positive(name, value)})
-    if not resume and config.steps is None and config.max_seconds is None:
-        config = replace(config, max_seconds=600.0)
-    if resume and (Path(out) / CONFIG).exists():
+    recorded = resume and (Path(out) / CONFIG).exists()
+    if not recorded and config.steps is None and config.max_seconds is None:
+        if config.preset not in PUBLISHED_STEPS:
+            config = replace(config, max_seconds=600.0)
+    if recorded:
         _require_same_settings(Path(out), config, assignments)
     return training.start(
         data,
@@ -189,6 +194,8 @@ def render(
     Raises:
         InputError: if the target or its dataset cannot be read.
     """
+    from .tasks import render as rendering
+
     source = target.folder if isinstance(target, Run) else target
     count, images = rendering.frames_of(
         source, active_variant(variant), path=path, frames=frames, size=size, spp=spp
@@ -203,6 +210,8 @@ def render(
 
 def pictures(dataset: Dataset) -> list[Image]:
     """The views of a dataset as :func:`evaluate` sees them: (H, W, 3) sRGB on white, 8 bits."""
+    from .tasks.evaluate import reference_image
+
     return [reference_image(dataset, k) for k in range(len(dataset))]
 
 

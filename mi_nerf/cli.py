@@ -14,7 +14,7 @@ from typing import Any
 import tyro
 
 from .base.errors import InputError
-from .commands import COMMANDS, command_type
+from .commands import COMMANDS, all_commands, examples
 from .commands.shared import flag
 from .commands.usage import unknown_command, usage_error
 from .training.run import TrainingError
@@ -49,21 +49,23 @@ def _parse(arguments: list[str]) -> Any:
         arguments = ["--help"]
     if arguments[0] not in COMMANDS and not arguments[0].startswith("-"):
         raise InputError(unknown_command(arguments[0], COMMANDS))
+    name = arguments[0] if arguments[0] in COMMANDS else None
     message = io.StringIO()
     try:
         with contextlib.redirect_stderr(message):
             return tyro.cli(
-                command_type(arguments[0] if arguments[0] in COMMANDS else None),
-                prog="mi-nerf",
-                description="Neural radiance fields in Mitsuba 3.",
-                args=_spread_lists(arguments),
+                all_commands() if name is None else COMMANDS[name],
+                prog="mi-nerf" if name is None else f"mi-nerf {name}",
+                description="Neural radiance fields in Mitsuba 3."
+                if name is None
+                else examples(name),
+                args=_spread_lists(arguments[name is not None :]),
                 config=(tyro.conf.DisallowNone,),
             )
     except SystemExit as stop:
         if stop.code in (0, None):
             raise
-        command = COMMANDS.get(arguments[0])
-        fields = dataclasses.fields(command) if command else ()
+        fields = () if name is None else dataclasses.fields(COMMANDS[name])
         options = ["--" + field.name.replace("_", "-") for field in fields]
         raise InputError(usage_error(message.getvalue(), arguments, options)) from None
 

@@ -254,7 +254,7 @@ def test_the_field_of_a_capture(capture: Path) -> None:
 def test_silhouettes_do_not_carve_projected_boxes(capture: Path) -> None:
     dataset = load_dataset(capture, "train")
     assert dataset.box is not None
-    transparent = replace(dataset, has_alpha=True, images=0 * dataset.images)
+    transparent = replace(dataset, has_alpha=True, images=0 * dataset.premultiplied())
     assert hull.view_box(transparent) == dataset.box
     assert hull.carve(transparent, *dataset.box, 8).all()
     assert hull.tighten(transparent, *dataset.box) == dataset.box
@@ -266,7 +266,7 @@ def test_training_learns_the_capture(forward_run: Path, tmp_path: Path) -> None:
     file = tmp_path / "result.json"
     assert main(["eval", str(forward_run), "--json", str(file)]) == 0
     record = json.loads(file.read_text())
-    truth = load_dataset(record_data(forward_run), "test").images[..., :3]
+    truth = load_dataset(record_data(forward_run), "test").premultiplied()[..., :3]
     even = -10 * np.log10(np.var(truth.reshape(-1, 3), axis=0).mean())
     assert record["views"] == 2 and record["mean"]["psnr"] > even + 3
     contents = load_field(forward_run / "field.safetensors")

@@ -50,11 +50,26 @@ def upload(array_type: Any, values: Any) -> Any:
 
 def _aligned(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     """A contiguous copy whose memory starts at a multiple of a cache line."""
-    memory = np.empty(values.nbytes + _CACHE_LINE, np.uint8)
-    start = -memory.ctypes.data % _CACHE_LINE
-    copy = memory[start : start + values.nbytes].view(values.dtype).reshape(values.shape)
+    copy = aligned_empty(values.shape, values.dtype)
     copy[...] = values
     return copy
+
+
+def aligned_empty(shape: tuple[int, ...], dtype: Any) -> np.ndarray[Any, Any]:
+    """A contiguous array, not initialised, whose memory starts at a multiple of a cache line."""
+    count = int(np.prod(shape)) * np.dtype(dtype).itemsize
+    memory = np.empty(count + _CACHE_LINE, np.uint8)
+    start = -memory.ctypes.data % _CACHE_LINE
+    return memory[start : start + count].view(dtype).reshape(shape)
+
+
+def borrow(array_type: Any, values: np.ndarray[Any, Any]) -> Any:
+    """Flat ``values`` where they lie, if Dr.Jit can use them there, or else a copy.
+
+    On the CPU, memory from :func:`aligned_empty` is shared: it must not change any more.
+    """
+    shared = values.flags.c_contiguous and values.ctypes.data % _CACHE_LINE == 0
+    return array_type(values) if shared else upload(array_type, values)
 
 
 def vector3_type(float_type: type) -> Any:

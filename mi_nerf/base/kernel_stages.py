@@ -14,12 +14,15 @@ each boundary waits for the kernels launched so far. The kernels stay the same.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeVar
 
 import drjit as dr
+
+HOST = "Host"  # the type of a launch that was none: work of the calling thread
 
 T = TypeVar("T")
 
@@ -41,7 +44,7 @@ class Launch:
     """One kernel, or another operation of Dr.Jit on the device."""
 
     stages: tuple[Stage, ...]  # open at its launch, from the outside in
-    type: Any  # drjit.KernelType
+    type: Any  # drjit.KernelType, or HOST
     size: int  # number of threads
     code: str  # hash of a just-in-time compiled kernel; else empty
     milliseconds: float  # on the device
@@ -94,6 +97,19 @@ def settled(value: T) -> T:
     if _recorder is not None:
         dr.eval(value)
     return value
+
+
+@contextmanager
+def host_work(size: int) -> Iterator[None]:
+    """What happens inside is no kernel, but work on ``size`` entries that counts as one."""
+    if _recorder is None:
+        yield
+        return
+    _recorder.collect()
+    begin = time.perf_counter()
+    yield
+    elapsed = 1e3 * (time.perf_counter() - begin)
+    _recorder.launches.append(Launch(tuple(_recorder._open), HOST, size, "", elapsed, False))
 
 
 @contextmanager

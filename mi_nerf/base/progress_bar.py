@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import sys
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-with warnings.catch_warnings():
-    # Without ipywidgets, a notebook gets bars of text, which is no reason to warn.
-    warnings.filterwarnings("ignore", message="IProgress not found")
-    from tqdm.auto import tqdm
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 
 def bars_are_seen() -> bool:
@@ -28,4 +26,18 @@ def progress_bar(
 ) -> tqdm[Any]:
     """A bar where bars are seen; otherwise one that draws nothing."""
     hidden = not (show and bars_are_seen())
-    return tqdm(desc=name, unit=unit, total=total, disable=hidden, **options)
+    return _kind_of_bar()(desc=name, unit=unit, total=total, disable=hidden, **options)
+
+
+def _kind_of_bar() -> Any:
+    """The bars of terminals, or of notebooks, which take longer to import."""
+    if not in_notebook():
+        import tqdm
+
+        return tqdm.tqdm
+    with warnings.catch_warnings():
+        # Without ipywidgets, a notebook gets bars of text, which is no reason to warn.
+        warnings.filterwarnings("ignore", message="IProgress not found")
+        from tqdm.auto import tqdm as either
+
+        return either

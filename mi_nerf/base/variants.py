@@ -55,6 +55,23 @@ def active_variant(requested: str | None = None) -> str:
     return choose_variant(requested)
 
 
+def has_cooperative_vectors(variant: str) -> bool:
+    """Whether networks can run on tensor cores, as cooperative vectors in half precision.
+
+    That takes an NVIDIA driver R570 or newer, with OptiX, through which Dr.Jit compiles them.
+    """
+    if not variant.startswith("cuda") or variant not in available_variants():
+        return False
+    from drjit import nn
+
+    half = array_module(variant).Float16
+    try:
+        nn.CoopVec(half(0), half(0))
+    except RuntimeError:
+        return False
+    return True
+
+
 @contextmanager
 def using_variant(variant: str) -> Iterator[None]:
     """Sets a Mitsuba variant, and at the end the one that was set before, if any was.

@@ -8,10 +8,9 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from ..api import evaluate
 from ..base.files import check_file, check_folder, make_folder, write_json
 from ..base.variants import choose_variant
-from ..tasks.evaluate import quality
+from ..tasks.evaluate import evaluate, quality
 from .shared import Variant, progress_bar
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from ..api import describe
+from ..tasks.describe import describe
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from tqdm.auto import tqdm
+from tqdm import tqdm
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..base.errors import InputError

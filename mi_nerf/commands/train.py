@@ -27,6 +27,8 @@ class Train:
 
     mi-nerf train lego/ --out runs/chosen --preset auto --max-seconds 300
 
+    mi-nerf train lego/ --out runs/published --preset paper --steps 3000
+
     mi-nerf train lego/ --out runs/lego --resume
     """
 
@@ -37,7 +39,8 @@ class Train:
     preset: str = "nerf"
     """Starting point of all settings: nerf, fast, paper, or auto to choose the model itself."""
     max_seconds: float | None = None
-    """Stop after so many seconds of wall-clock time (default 600 if --steps is not given)."""
+    """Stop after so many seconds of wall-clock time (default 600 if --steps is not given; paper
+    has a schedule of its own, 200,000 steps, if they take less than a day)."""
     steps: int | None = None
     """Stop after so many steps."""
     downscale: int = 1
@@ -67,6 +70,9 @@ class Train:
         )
         said = [str(decision) for decision in run.decisions]
         print("".join(f"auto: {line}\n" for line in said), end="")
+        print(f"model: {run.sizes}")
+        if run.forecast is not None:
+            print(f"{self.preset}: {run.forecast.sentence()}", flush=True)
         run.train()
         for line in map(str, run.decisions):  # what has become clear on the way
             if line not in said:

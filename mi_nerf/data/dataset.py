@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +15,7 @@ from ..base.color import ColorSpace
 from ..base.errors import InputError
 from ..cameras.ndc import Ndc
 from ..cameras.pinhole import Intrinsics
+from ..images.stored import is_stored, premultiplied
 
 
 # Compared by identity: equality of arrays has no single truth value.
@@ -28,7 +30,9 @@ class Dataset:
     path: Path  # the dataset's folder
     split: str  # "train", "val", "test" or another name that the folder knows
     names: tuple[str, ...]  # of the views, e.g. "r_0"
-    images: NDArray[np.float32]  # (N, H, W, 4) premultiplied RGBA in `color_space`
+    # (N, H, W, 4) RGBA in `color_space`: premultiplied floats, or straight 8 or 16 bits as
+    # the files hold them; see mi_nerf.images.stored. `image(i)` and `premultiplied()` are floats.
+    images: NDArray[Any]
     color_space: ColorSpace  # "srgb" for 8- and 16-bit files, "linear" for EXR
     has_alpha: bool  # False: the files have no alpha channel and alpha is 1
     cam_to_world: NDArray[np.float64]  # (N, 4, 4), OpenGL axes
@@ -43,12 +47,22 @@ class Dataset:
         n, size = len(self.names), (self.intrinsics.height, self.intrinsics.width)
         if self.images.shape != (n, *size, 4):
             raise ValueError(f"{n} views of {size} pixels, but images have {self.images.shape}")
+        if not is_stored(self.images.dtype):
+            raise ValueError(f"images of type {self.images.dtype}, expected 8 or 16 bits or floats")
         if self.cam_to_world.shape != (n, 4, 4):
             raise ValueError(f"{n} views, but poses have shape {self.cam_to_world.shape}")
 
     def __len__(self) -> int:
         """The number of views."""
         return len(self.names)
+
+    def image(self, index: int) -> NDArray[np.float32]:
+        """View number ``index``, (H, W, 4) premultiplied."""
+        return premultiplied(self.images[index])
+
+    def premultiplied(self) -> NDArray[np.float32]:
+        """All views, (N, H, W, 4) premultiplied: four times the memory of 8-bit images."""
+        return premultiplied(self.images)
 
     def composited(self, background: ArrayLike = 1.0) -> NDArray[np.float32]:
         """The images over a background: ``rgb + (1 - a)·background`` (Porter & Duff 1984).
@@ -64,8 +78,8 @@ class Dataset:
         Returns:
             Opaque images, (N, H, W, 3).
         """
-        transmitted = 1 - self.images[..., 3:]
-        return self.images[..., :3] + transmitted * np.asarray(background, np.float32)
+        images = self.premultiplied()
+        return images[..., :3] + (1 - images[..., 3:]) * np.asarray(background, np.float32)
 
     def subset(self, indices: Sequence[int]) -> Dataset:
         """The views at ``indices``, in that order.

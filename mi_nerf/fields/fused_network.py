@@ -48,8 +48,16 @@ class FusedNetwork:
         Args:
             position, direction: features, one array of N values each.
         """
+        return self.answer(position, None if direction is None else self.seen(direction))
+
+    def seen(self, direction: list[Floats]) -> Any:
+        """What the features of a direction add in the layer that sees them, for :meth:`answer`."""
+        layer = next(layer for layer in self._config.color() if layer.sees)
+        return nn.matvec(self._views[layer.second_weight], nn.CoopVec(*direction))
+
+    def answer(self, position: list[Floats], seen: Any) -> tuple[Floats, list[Floats]]:
+        """As a call, for directions of which :meth:`seen` is known, or ``None``."""
         h = self._trunk(position)
-        seen = None if direction is None else nn.CoopVec(*direction)
         density = self._apply(self._config.density(), h, None)
         color = evaluate(self._config.color(), self._apply, h, direction=seen)
         return next(iter(density)), list(color)
@@ -65,7 +73,9 @@ class FusedNetwork:
     def _apply(self, layer: Layer, x: Any, seen: Any) -> Any:
         views = self._views
         y = nn.matvec(views[layer.weight], x, views[layer.bias])
-        if layer.sees:
+        if layer.sees == "direction":
+            y = y + seen
+        elif layer.sees:
             y = y + nn.matvec(views[layer.second_weight], seen)
         return self._rectified(y) if layer.rectify else y
 

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 from drjit.nn import HashGridEncoding
 
 from ..base.arrays import Floats, Tensor, Vectors, vector3_type
@@ -23,7 +24,7 @@ class HashGridConfig:
 
     levels: int = 8  # resolutions
     features: int = 4  # a vertex of every level; four are gathered at once
-    log2_entries: int = 16  # vertices that a level has memory for, at most 2 to this power
+    log2_entries: int | None = 16  # a level stores at most 2 to this power; none: by the images
     coarsest: int = 16  # vertices along [−1, 1] at the first level
     finest: int | None = None  # vertices at the last level; none: as many as the images resolve
 
@@ -35,7 +36,7 @@ class HashGridConfig:
             ("coarsest", 2, 1 << 16),
         ):
             value = getattr(self, name)
-            if not lowest <= value <= highest:
+            if value is not None and not lowest <= value <= highest:
                 raise ValueError(f"grid: {name}={value}, expected {lowest} to {highest}")
         if self.features > 1 and self.features % 2:
             raise ValueError(f"grid: features={self.features}, expected 1 or an even number")
@@ -56,13 +57,24 @@ class HashGridConfig:
 
     def entries(self) -> int:
         """Vertices in memory, of all levels together."""
-        total = 0
+        return sum(self.level_entries())
+
+    def level_entries(self) -> list[int]:
+        """Vertices in memory of each level, which follow each other in the table."""
+        found = []
         for level in range(self.levels):
             scale = 2.0 ** (level * math.log2(self.growth())) * self.coarsest - 1
             vertices = (math.ceil(scale) + 1) ** 3
             vertices = -(-vertices // self.features) * self.features
-            total += min(vertices, 1 << self.log2_entries)
-        return total
+            found.append(min(vertices, self.most_entries))
+        return found
+
+    @property
+    def most_entries(self) -> int:
+        """Vertices that a level has memory for at most, once that is found."""
+        if self.log2_entries is None:
+            raise ValueError("grid: log2_entries is not found yet, expected a number")
+        return 1 << self.log2_entries
 
 
 class HashGrid:
@@ -76,7 +88,7 @@ class HashGrid:
             3,
             n_levels=config.levels,
             n_features_per_level=config.features,
-            hashmap_size=1 << config.log2_entries,
+            hashmap_size=config.most_entries,
             base_resolution=config.coarsest,
             per_level_scale=config.growth(),
         )
@@ -84,9 +96,18 @@ class HashGrid:
             raise RuntimeError("Dr.Jit lays out hash grids in another way than expected")
         self._encoding.data = None
 
-    def features(self, p: Vectors, table: Tensor) -> list[Floats]:
-        """The ``size`` features of the 3-vectors ``p`` in [−1, 1]³, one array each."""
+    def features(self, p: Vectors, table: Tensor, level_weights: Floats = None) -> list[Floats]:
+        """The ``size`` features of the 3-vectors ``p`` in [−1, 1]³, one array each.
+
+        Args:
+            level_weights: one number a level, by which its features are multiplied.
+        """
         encoding = copy.copy(self._encoding)  # the table is this call's alone
         encoding.data = table.array
         found = encoding(vector3_type(type(p[0]))(*(0.5 * p[i] + 0.5 for i in range(3))))
-        return [found[i] for i in range(self._config.size)]
+        features = [found[i] for i in range(self._config.size)]
+        if level_weights is None:
+            return features
+        kind, index = type(level_weights), dr.uint32_array_t(type(level_weights))
+        weights = [dr.gather(kind, level_weights, index(i)) for i in range(self._config.levels)]
+        return [f * weights[i // self._config.features] for i, f in enumerate(features)]

@@ -209,11 +209,15 @@ def color_head(
     config: NetworkConfig, weights: Mapping[str, Any], h: Tensor, direction: Tensor
 ) -> list[Floats]:
     """Raw colour of N queries, one array a channel; ``direction`` is γ(d) as a tensor."""
-    raw = evaluate(config.color(), partial(_apply, weights), h, direction=direction)
-    flat, count = raw.array, raw.shape[1]
+    return rows(evaluate(config.color(), partial(_apply, weights), h, direction=direction))
+
+
+def rows(tensor: Tensor) -> list[Floats]:
+    """The rows of an ``(F, N)`` tensor as arrays."""
+    flat, count = tensor.array, tensor.shape[1]
     float_type = type(flat)
     column = dr.arange(dr.uint32_array_t(float_type), count)
-    return [dr.gather(float_type, flat, column + i * count) for i in range(3)]
+    return [dr.gather(float_type, flat, column + i * count) for i in range(tensor.shape[0])]
 
 
 def _apply(weights: Mapping[str, Any], layer: Layer, x: Tensor, seen: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import drjit as dr
 import numpy as np
 
 from ..base.arrays import Floats, Tensor, Vectors, upload, vector3_type
@@ -17,10 +18,12 @@ from ..base.kernel_stages import settled, stage
 from ..cameras.ndc import Ndc
 from . import network
 from .activations import ColorActivation, DensityActivation, apply_activation
+from .blas_network import network_product, worth_blas
 from .fourier import FourierEncoding, stack_rows
+from .frozen_features import FrozenFeatures
 from .fused_network import FusedNetwork, HalfNetwork, worth_fusing
 from .hash_grid import HashGrid, HashGridConfig
-from .network import NetworkConfig
+from .network import NetworkConfig, rows
 from .noise import DensityNoise
 from .protocol import Field
 
@@ -98,6 +101,7 @@ class NeuralField(Field):
 
     coarse: NeuralField | None
     _noise: DensityNoise | None = None  # added to raw densities, in training
+    level_weights: Any = None  # of the hash grid's levels, where they join one by one
     _loss_scale: Any = None  # one value, in training: the network runs in half precision
 
     def __init__(
@@ -124,9 +128,11 @@ class NeuralField(Field):
             if weights[name].shape != shape:
                 raise ValueError(f"tensor '{name}' is {weights[name].shape}, expected {shape}")
         self._weights = {name: upload(tensor_type, weights[name]) for name in shapes}
-        self._grid = None
+        self._on_host = worth_blas(config.network, tensor_type)
+        self._grid = self._frozen = None
         if config.grid is not None:
             self._grid = HashGrid(config.grid, type(self._weights[network.GRID].array))
+            self._frozen = FrozenFeatures(self._features_of)
 
     @classmethod
     def create(
@@ -162,10 +168,16 @@ class NeuralField(Field):
         return self._weights
 
     def weights(self) -> dict[str, np.ndarray[Any, Any]]:
-        """A copy of all tensors as NumPy arrays."""
-        return {name: np.array(tensor) for name, tensor in self._weights.items()}
+        """A copy of all tensors as NumPy arrays, of the grid as its levels count now."""
+        found = {name: np.array(tensor) for name, tensor in self._weights.items()}
+        if self.level_weights is not None and self.config.grid is not None:
+            weights = np.repeat(np.array(self.level_weights), self.config.grid.level_entries())
+            found[network.GRID] *= weights[:, None]
+        return found
 
     def density(self, p: Vectors) -> Floats:
+        if self._on_host and not _recorded():
+            return self._density(self._product(p)[0], p)
         raw = network.density_head(self.config.network, self._weights, self._trunk(p))
         return self._density(raw, p)
 
@@ -174,9 +186,10 @@ class NeuralField(Field):
         config = self.config
         if self._loss_scale is not None:
             return self._answer(HalfNetwork(config.network, self._weights, self._loss_scale), p, d)
-        h = self._trunk(p)
-        with stage("encoding"):
-            direction = settled(config.direction(d)) if config.network.view_dependent else None
+        if self._on_host and not _recorded():
+            density, *color = self._product(p, d)
+            return self._density(density, p), self._color(color)
+        h, direction = self._trunk(p), self._direction(d)
         raw = network.color_head(config.network, self._weights, h, direction)
         density = network.density_head(config.network, self._weights, h)
         return self._density(density, p), self._color(raw)
@@ -196,6 +209,21 @@ class NeuralField(Field):
 
         return density_emission if emission else density
 
+    def fused_along(self, d: Vectors) -> Callable[..., Any] | None:
+        """See :meth:`Field.fused_along`; the first layer's share of the direction is hoisted."""
+        config = self.config
+        if not worth_fusing(config.network, type(next(iter(self._weights.values())).array)):
+            return None
+        fused, seen = FusedNetwork(config.network, self._weights), None
+        if config.network.view_dependent:
+            seen = fused.seen(config.direction.features(d))
+
+        def density_emission(p: Vectors) -> tuple[Floats, list[Floats]]:
+            density, color = fused.answer(self._features(p), seen)
+            return self._density(density, p), self._color(color)
+
+        return density_emission
+
     def _answer(self, fused: FusedNetwork, p: Vectors, d: Vectors) -> tuple[Floats, list[Floats]]:
         config = self.config
         direction = config.direction.features(d) if config.network.view_dependent else None
@@ -204,17 +232,46 @@ class NeuralField(Field):
 
     def _trunk(self, p: Vectors) -> Tensor:
         with stage("encoding"):
-            position = settled(stack_rows(self._features(p)))
+            position = settled(self._position(p))
         return network.trunk(self.config.network, self._weights, position)
 
-    def _features(self, p: Vectors) -> list[Floats]:
+    def _product(self, p: Vectors, d: Vectors | None = None) -> list[Floats]:
+        """Raw density, and raw colours with ``d``, by matrix products of the host's."""
+        weights = {n: w for n, w in self._weights.items() if n != network.GRID}
+        emission = d is not None
+        with stage("encoding"):
+            features = {"position": self._position(p)}
+            if emission and self.config.network.view_dependent:
+                features["direction"] = self.config.direction(d)
+            features = settled(features)  # together, as the product takes them
+        raw = network_product(self.config.network, weights, features, emission=emission)
+        return rows(raw)
+
+    def _position(self, p: Vectors) -> Tensor:
+        if self._frozen is None or dr.grad_enabled(p) or _recorded():
+            return stack_rows(self._features(p))
+        return self._frozen(self._unit(p), self._weights[network.GRID], self.level_weights)
+
+    def _direction(self, d: Vectors) -> Tensor | None:
+        if not self.config.network.view_dependent:
+            return None
+        with stage("encoding"):
+            return settled(self.config.direction(d))
+
+    def _unit(self, p: Vectors) -> Vectors:
         config = self.config
-        unit = vector3_type(type(p[0]))(
+        return vector3_type(type(p[0]))(
             *((p[i] - config.input_center[i]) * config.input_scale for i in range(3))
         )
-        features = config.position.features(unit)
+
+    def _features(self, p: Vectors) -> list[Floats]:
+        table = None if self._grid is None else self._weights[network.GRID]
+        return self._features_of(self._unit(p), table, self.level_weights)
+
+    def _features_of(self, unit: Vectors, table: Tensor, level_weights: Floats) -> list[Floats]:
+        features = self.config.position.features(unit)
         if self._grid is not None:
-            features += self._grid.features(unit, self._weights[network.GRID])
+            features += self._grid.features(unit, table, level_weights)
         return features
 
     def _color(self, raw: list[Floats]) -> list[Floats]:
@@ -226,3 +283,8 @@ class NeuralField(Field):
         if self._noise is not None:
             raw = raw + self._noise.at(p)
         return apply_activation(config.density_activation, raw) * config.density_scale
+
+
+def _recorded() -> bool:
+    """Whether ``dr.freeze`` of a caller records: it sees no work of the host."""
+    return bool(dr.flag(dr.JitFlag.FreezingScope))

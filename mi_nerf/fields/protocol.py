@@ -46,3 +46,8 @@ class Field(ABC):
         Without ``emission``, :meth:`density`. ``None`` where there is no faster way.
         """
         return None
+
+    def fused_along(self, d: Vectors) -> Callable[..., Any] | None:
+        """:meth:`fused` as a function of positions alone, for many along the same directions."""
+        ask = self.fused()
+        return None if ask is None else lambda p: ask(p, d)

@@ -1,27 +1,27 @@
-"""Image files to premultiplied float32 arrays.
+"""Image files to arrays, as :mod:`mi_nerf.images.stored` describes them.
 
-Premultiplied because that is the form in which pixels may be averaged: the mean
-of straight colours lets invisible pixels bleed into visible ones (Porter & Duff
-1984).
+Pixels are averaged premultiplied: the mean of straight colours lets invisible pixels
+bleed into visible ones (Porter & Duff 1984).
 """
 
 from __future__ import annotations
 
 import os
 import struct
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
 from ..base.color import ColorSpace
 from ..base.errors import InputError
+from .stored import empty_stack, premultiplied, with_alpha
 
 IMAGE_SUFFIXES = {".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
 
@@ -43,7 +43,7 @@ Progress = Callable[[int, int], None]
 class ImageFile(NamedTuple):
     """One decoded file."""
 
-    pixels: NDArray[np.float32]  # (H, W, 4), premultiplied
+    pixels: NDArray[Any]  # (H, W, 4), as stored
     has_alpha: bool  # False: alpha is 1 throughout
     color_space: ColorSpace
 
@@ -51,7 +51,7 @@ class ImageFile(NamedTuple):
 class ImageStack(NamedTuple):
     """The files of one split."""
 
-    pixels: NDArray[np.float32]  # (N, H/k, W/k, 4), premultiplied, k the downscale
+    pixels: NDArray[Any]  # (N, H/k, W/k, 4) as stored; premultiplied floats for a downscale k > 1
     has_alpha: bool  # whether any of the files has an alpha channel
     color_space: ColorSpace
     width: int  # of the files, before downscaling
@@ -62,6 +62,8 @@ def read_images(
     paths: Sequence[Path], downscale: int = 1, progress: Progress | None = None
 ) -> ImageStack:
     """Reads images of one size, on a small pool of threads.
+
+    They stay as stored if all files hold the same type of value, and none are averaged.
 
     Args:
         paths: The files, at least one; formats as for :func:`read_image`.
@@ -78,12 +80,20 @@ def read_images(
         raise InputError(f"{paths[0]}: downscale {downscale} leaves no pixel of {width}x{height}")
 
     # Each thread writes its own slot: no second copy of the whole stack.
-    stack = np.empty((len(paths), height // downscale, width // downscale, 4), np.float32)
+    shape = (len(paths), height // downscale, width // downscale, 4)
+    kind = first.pixels.dtype if downscale == 1 else np.dtype(np.float32)
+    stack = empty_stack(shape, kind)
+    other = threading.Event()  # a file holds another type of value than the first
 
     def load(index: int) -> bool:
         image = first if index == 0 else read_image(paths[index])
         _require_same_kind(image, paths[index], first, paths[0])
-        stack[index] = average_blocks(image.pixels, downscale)
+        if kind == np.float32:
+            stack[index] = average_blocks(premultiplied(image.pixels), downscale)
+        elif image.pixels.dtype == kind:
+            stack[index] = image.pixels
+        else:
+            other.set()
         return image.has_alpha
 
     has_alpha = False
@@ -94,7 +104,17 @@ def read_images(
             has_alpha |= alpha
             if progress is not None:
                 progress(done, len(paths))
+    if other.is_set():
+        stack = _read_as_floats(paths, shape)
     return ImageStack(stack, has_alpha, first.color_space, width, height)
+
+
+def _read_as_floats(paths: Sequence[Path], shape: tuple[int, int, int, int]) -> NDArray[Any]:
+    """Files that are known to agree in all but the type of their values."""
+    stack = empty_stack(shape, np.float32)
+    for index, path in enumerate(paths):
+        stack[index] = premultiplied(read_image(path).pixels)
+    return stack
 
 
 def read_image(path: Path) -> ImageFile:
@@ -152,14 +172,7 @@ def _read_integers(path: Path) -> ImageFile:
         channels = 1 if values.ndim == 2 else values.shape[2]
         raise InputError(f"{path}: expected RGB or RGBA, got {channels} channel(s), {mode}")
 
-    # Straight integers over their full range to premultiplied [0, 1].
-    height, width, channels = values.shape
-    pixels = np.ones((height, width, 4), np.float32)
-    pixels[..., :channels] = values
-    pixels[..., :channels] /= np.float32(np.iinfo(values.dtype).max)
-    if channels == 4:
-        pixels[..., :3] *= pixels[..., 3:]
-    return ImageFile(pixels, channels == 4, "srgb")
+    return ImageFile(with_alpha(values), values.shape[2] == 4, "srgb")
 
 
 def _decode_integers(path: Path) -> tuple[NDArray[np.uint8] | NDArray[np.uint16], str]:
@@ -193,6 +206,8 @@ def _decode_with(path: Path, layout: str) -> NDArray[np.uint8]:
 
 
 def _read_exr(path: Path) -> ImageFile:
+    import OpenEXR  # here: most datasets do without
+
     with _corruption_as_input_error(path):
         # No threads of its own: the caller already has one for each core.
         file = OpenEXR.File(str(path), separate_channels=True, num_threads=0)
@@ -205,7 +220,8 @@ def _read_exr(path: Path) -> ImageFile:
 
     has_alpha = "A" in channels
     height, width = channels["R"].pixels.shape
-    pixels = np.ones((height, width, 4), np.float32)
+    halves = all(c.pixels.dtype == np.float16 for n, c in channels.items() if n in "RGBA")
+    pixels = np.ones((height, width, 4), np.float16 if halves else np.float32)
     for i, name in enumerate("RGBA" if has_alpha else "RGB"):
         pixels[..., i] = channels[name].pixels
     broken = int(np.count_nonzero(~np.isfinite(pixels).all(axis=-1)))

@@ -19,6 +19,7 @@ import numpy as np
 from ..base.arrays import upload, vector3_type
 from ..base.box import Corner
 from ..fields.protocol import Field
+from .bit_field import BitField
 
 # Value of a cell that was never looked at: occupied whatever the threshold.
 _UNSEEN = np.float32(np.finfo(np.float32).max)
@@ -35,6 +36,8 @@ _FLOOR_RISE = 0.1
 
 class OccupancyGrid:
     """Cells of an axis-aligned box, each with a decaying maximum and a floor of its density."""
+
+    _bits: BitField | None = None  # of the mask, as last asked for
 
     def __init__(
         self, lower: Corner, upper: Corner, cells: np.ndarray[Any, Any], float_type: Any
@@ -109,11 +112,23 @@ class OccupancyGrid:
     def cell(self, p: Any) -> Any:
         """Numbers of the cells in which points (in field coordinates) lie."""
         index = self._uint(0)
-        for i, size in enumerate(self.cell_size):
-            last = self.shape[i] - 1
-            along = dr.floor((p[i] - float(self.lower[i])) * float(1 / size))
-            index = index * self.shape[i] + self._uint(dr.fmin(dr.fmax(along, 0), float(last)))
+        for along, size in zip(self.coordinates(p), self.shape, strict=True):
+            index = index * size + along
         return index
+
+    def coordinates(self, p: Any) -> list[Any]:
+        """Cells of points, counted along each axis; the nearest ones for points outside."""
+        result = []
+        for i, size in enumerate(self.cell_size):
+            along = dr.floor((p[i] - float(self.lower[i])) * float(1 / size))
+            result.append(self._uint(dr.fmin(dr.fmax(along, 0), float(self.shape[i] - 1))))
+        return result
+
+    def bits(self) -> BitField:
+        """The cells that are sampled, for walks along rays."""
+        if self._bits is None or self._bits.mask is not self._mask:
+            self._bits = BitField(self._mask, self.shape)
+        return self._bits
 
     def occupied(self, cell: Any) -> Any:
         """Whether cells may hold something."""

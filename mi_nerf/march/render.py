@@ -24,6 +24,7 @@ from .placing import place_samples
 from .quadrature import integrate
 from .query import Evaluation
 from .settings import MarchSettings
+from .walk import can_walk, walk_rays
 
 
 @dataclass
@@ -46,7 +47,7 @@ def ray_chunks(rays: int, settings: MarchSettings) -> Iterator[tuple[int, int]]:
 def render_rays(
     marched: MarchedField, o: Vectors, d: Vectors, *, jitter: Floats = None
 ) -> RayImage:
-    """Renders R rays without derivatives, in chunks of bounded memory.
+    """Renders R rays without derivatives: in one kernel, or in chunks of bounded memory.
 
     Args:
         o, d: origins and unit directions, in the field's coordinates.
@@ -55,6 +56,11 @@ def render_rays(
     """
     float_type, settings = type(o[0]), marched.settings
     rays = max(len(o[0]), len(d[0]))
+    one_a_ray = jitter is None or len(jitter) == rays
+    if rays and one_a_ray and can_walk(marched):
+        walked = walk_rays(marched, o, d, jitter=jitter)
+        queries = int(dr.sum(walked.queries)[0])
+        return RayImage(walked.color, walked.opacity, walked.depth, queries)
     outputs = [dr.zeros(float_type, rays) for _ in range(5)]
     queries = 0
     with dr.suspend_grad():

@@ -129,7 +129,7 @@ def sample_weights(density: Floats, delta: Floats, samples: int) -> tuple[Floats
     Returns:
         ``(weights, opacity)``, R·S and R values.
     """
-    tau = _opaque_at_most(density * delta)
+    tau = opaque_at_most(density * delta)
     transmittance = dr.exp(-dr.block_prefix_sum(tau, samples, exclusive=True))
     weights = transmittance * one_minus_exp(tau)
     return weights, one_minus_exp(dr.block_sum(tau, samples))
@@ -157,8 +157,8 @@ def linear_weights(
     before, after = neighbours(density, samples)
     tau_below = below * (0.75 * density + 0.25 * before)
     tau_above = above * (0.75 * density + 0.25 * after)
-    first = _opaque_at_most(tau_below)
-    tau = first + _opaque_at_most(tau_above)
+    first = opaque_at_most(tau_below)
+    tau = first + opaque_at_most(tau_above)
     start = dr.block_prefix_sum(tau, samples, exclusive=True)
     # How much of a half's width is seen.
     below = below * dr.exp(-start) * mean_transmittance(tau_below)
@@ -170,6 +170,6 @@ def linear_weights(
     return weights, one_minus_exp(dr.block_sum(tau, samples))
 
 
-def _opaque_at_most(tau: Floats) -> Floats:
+def opaque_at_most(tau: Floats) -> Floats:
     """Limits optical depths; lets NaN through."""
     return dr.select(tau > MAX_OPTICAL_DEPTH, MAX_OPTICAL_DEPTH, tau)

@@ -8,6 +8,7 @@ Forwards, from a pixel to the film (``nerf``; what is called stands below what c
       field_scene.FieldScene.trace
         backdrop.Backdrop.intersect       where is the first surface?
         integral.see                      for each chunk of rays that cross a field, up to there:
+          march.walk.walk_rays            a narrow network: in one kernel, sample by sample; else
           integral.Integral
             crossing.Crossing               rays to field coordinates, samples placed, field asked
             march.quadrature.integrate      densities and colours to

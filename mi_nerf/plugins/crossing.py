@@ -11,7 +11,6 @@ import mitsuba as mi
 
 from ..base.errors import InputError
 from ..march.intervals import RaySegments, ray_segments
-from ..march.marched import MarchedField
 from ..march.merging import Layer
 from ..march.normals import density_gradient
 from ..march.placing import place_samples
@@ -46,7 +45,7 @@ class Crossing:
             dr.eval(o, d, self.scale)
             bounds = marched.bounds(rays.reach, self.scale)
             self.samples = place_samples(
-                MarchedField(self.field, self._march, self._placed.medium.occupancy),
+                marched.marched,
                 dr.detach(o),
                 dr.detach(d),
                 jitter=rays.jitter,

@@ -14,6 +14,7 @@ import numpy as np
 from ..base.color import srgb_to_linear
 from ..march.merging import integrate_merged, merge
 from ..march.quadrature import integrate
+from ..march.walk import can_walk
 from .crossing import Crossing, crossings
 from .sampled import Rays, SampledField
 
@@ -38,14 +39,19 @@ class Seen:
 
 
 def see(fields: list[SampledField], rays: Rays, *, normals: bool = False) -> Seen:
-    """Radiance and opacity of the fields along R rays, in chunks of bounded memory."""
+    """Radiance and opacity of the fields along R rays, in one kernel or in chunks."""
     count = len(rays.o[0])
     values = [dr.zeros(mi.Float, count) for _ in range(5)]
     index = dr.zeros(mi.Float, count)
     normal = mi.Normal3f(*(dr.zeros(mi.Float, count) for _ in range(3)))
     dr.make_opaque(values, index, normal)
-    for where, part in chunks(fields, rays):
-        integral = Integral(fields, part, dr.ADMode.Primal, normals=normals)
+    walks = len(fields) == 1 and not normals and can_walk(fields[0].marched)
+    for where, part in chunks(fields, rays, whole=walks):
+        integral = (
+            _walked(fields[0], part)
+            if walks
+            else Integral(fields, part, dr.ADMode.Primal, normals=normals)
+        )
         for output, value in zip(values, integral.values, strict=True):
             dr.scatter(output, value, where)
         dr.scatter(index, integral.index, where)
@@ -55,28 +61,41 @@ def see(fields: list[SampledField], rays: Rays, *, normals: bool = False) -> See
     return Seen(values, normal, index)
 
 
+def _walked(marched: SampledField, rays: Rays) -> Seen:
+    """What rays see of the only field, where it may be asked within a kernel."""
+    walked, scale = marched.walk(rays)
+    space = "linear" if marched.encoded else marched.field.color_space
+    color = _linear(space, walked.color, walked.opacity)
+    index = dr.select(walked.opacity > 0, mi.Float(1), 0)
+    return Seen([*color, walked.opacity, walked.depth / scale], mi.Normal3f(0), index)
+
+
 def transmittance(fields: list[SampledField], rays: Rays) -> Any:
     """The share of light that the fields let pass along R rays, without derivatives.
 
     As :class:`Integral` finds it. Only densities are asked for, and as they add up, nothing
-    has to be merged.
+    has to be merged: one field follows the other.
     """
-    through = dr.full(mi.Float, 1, len(rays.o[0]))
-    dr.make_opaque(through)
-    for where, part in chunks(fields, rays):
-        total = dr.zeros(mi.Float, len(where))
-        dr.make_opaque(total)
-        for crossing in crossings(fields, part, dr.ADMode.Primal, emission=False):
-            samples, density = crossing.samples, crossing.evaluation.density
-            depth = dr.block_sum(density * samples.delta, samples.count)
-            if crossing.ray is None:
-                total += depth
-            else:
-                dr.scatter_add(total, depth, crossing.ray)
+    total = dr.zeros(mi.Float, len(rays.o[0]))
+    dr.make_opaque(total)
+    for marched in fields:
+        walks = can_walk(marched.marched)
+        for where, part in chunks([marched], rays, whole=walks):
+            depth = (
+                marched.walk(part, emission=False)[0].optical_depth
+                if walks
+                else _optical_depth(marched, part)
+            )
+            dr.scatter(total, dr.gather(mi.Float, total, where) + depth, where)
             dr.eval(total)
-        dr.scatter(through, dr.exp(-total), where)
-        dr.eval(through)
-    return through
+    return dr.exp(-total)
+
+
+def _optical_depth(marched: SampledField, rays: Rays) -> Any:
+    """Of one field along rays that cross it."""
+    (crossing,) = crossings([marched], rays, dr.ADMode.Primal, emission=False)
+    samples, density = crossing.samples, crossing.evaluation.density
+    return dr.block_sum(density * samples.delta, samples.count)
 
 
 class Integral:
@@ -171,8 +190,10 @@ class Integral:
         self.normal = [n * inverse for n in sums]
 
 
-def chunks(fields: list[SampledField], rays: Rays) -> Iterator[tuple[Any, Rays]]:
-    """The rays that cross any field, in parts of bounded memory, with their numbers."""
+def chunks(
+    fields: list[SampledField], rays: Rays, *, whole: bool = False
+) -> Iterator[tuple[Any, Rays]]:
+    """The rays that cross any field, with their numbers: in parts of bounded memory, or whole."""
     samples = dr.zeros(mi.UInt32, len(rays.o[0]))  # of all fields along each ray
     for marched in fields:
         count = dr.opaque(mi.UInt32, marched.march.samples + marched.march.fine)
@@ -180,6 +201,9 @@ def chunks(fields: list[SampledField], rays: Rays) -> Iterator[tuple[Any, Rays]]
     dr.eval(samples)
     crossing = mi.UInt32(dr.compress(samples > 0))
     if not len(crossing):
+        return
+    if whole:
+        yield crossing, rays.take(crossing)
         return
     total = np.cumsum(np.array(dr.gather(mi.UInt32, samples, crossing)), dtype=np.int64)
     limit = min(marched.march.chunk for marched in fields)

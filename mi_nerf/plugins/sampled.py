@@ -11,7 +11,9 @@ import mitsuba as mi
 
 from ..base.arrays import gather_vector3
 from ..march.intervals import ray_segments
+from ..march.marched import MarchedField
 from ..march.settings import MarchSettings
+from ..march.walk import Walked, walk_rays
 from .placement import PlacedField
 
 
@@ -29,6 +31,19 @@ class SampledField:
     def field(self) -> Any:
         """The field."""
         return self.placed.medium.field
+
+    @property
+    def marched(self) -> MarchedField:
+        """The field in its own coordinates."""
+        return MarchedField(self.field, self.march, self.placed.medium.occupancy)
+
+    def walk(self, rays: Rays, *, emission: bool = True) -> tuple[Walked, Any]:
+        """What rays see, see :func:`mi_nerf.march.walk.walk_rays`; and local per world length."""
+        o, d, scale = self.placed.to_local(rays.o, rays.d)
+        dr.eval(o, d, scale)
+        bounds = self.bounds(rays.reach, scale)
+        marched, jitter = self.marched, rays.jitter
+        return walk_rays(marched, o, d, jitter=jitter, bounds=bounds, emission=emission), scale
 
     def unbounded(self) -> SampledField:
         """The same field for rays that do not come from a camera: near and far are its."""

@@ -12,7 +12,7 @@ import drjit as dr
 import numpy as np
 
 from ..base.errors import InputError
-from ..base.kernel_stages import Launch, recording
+from ..base.kernel_stages import HOST, Launch, recording
 from ..base.variants import array_module
 from ..data import load_dataset
 from ..tasks.tables import markdown_table, save_figure
@@ -29,7 +29,7 @@ LABELS = {
     "rays": "rays and pixels drawn, random numbers",
     "samples": "samples placed, empty ones left out, cut into blocks",
     "encoding": "features of positions and directions, rays gathered",
-    "products": "network: matrix products",
+    "products": "network: matrix products; all of a narrow one on a CPU",
     "network": "network: biases and activations, forward and adjoint",
     "scatter": "density and colour, scattered to the samples",
     "compositing": "compositing and loss, forward and adjoint",
@@ -155,7 +155,7 @@ def part_of_step(launch: Launch) -> str:
     """Which of ``LABELS`` a kernel counts in."""
     if "occupancy" in launch.stages:
         return "occupancy"
-    if launch.type == dr.KernelType.BatchedGemm:
+    if launch.type in (dr.KernelType.BatchedGemm, HOST):
         return "products"
     return launch.stages[-1] if launch.stages else "other"
 
@@ -266,8 +266,9 @@ def markdown(record: dict[str, Any]) -> list[str]:
         "is part of the stage that launches it. Dr.Jit fuses what it can: rays are gathered in the",
         "kernel of the features, gradients of the samples in the first kernel of the network's",
         "adjoint. Matrix products, with the packing of their factors, are told by the type of the",
-        "kernel. Python is what the kernels leave of the step; if they took longer there than the",
-        "step does here, as on a busy machine, they are scaled to fit. Neither padding of the last",
+        "kernel; narrow networks on a CPU, biases and activations included, are NumPy's products.",
+        "Python is what the kernels leave of the step; if they took longer there than the step",
+        "does here, as on a busy machine, they are scaled to fit. Neither padding of the last",
         "block nor queries of the occupancy grid count as arithmetic.",
     ]
 

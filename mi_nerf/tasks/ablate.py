@@ -64,7 +64,7 @@ def _no_hierarchy(config: TrainConfig) -> TrainConfig:
         fine=0,
         render_samples=samples,
         render_fine=None,
-        batch=max(old.batch, samples),
+        batch=None if old.batch is None else max(old.batch, samples),
     )
     return replace(config, sampling=sampling)
 

@@ -1,9 +1,9 @@
-"""Preset ``auto``: how a run begins, by its data, and why; it grows as it goes on.
+"""Preset ``auto``: how a run begins, by its data, and why; it takes shape as it goes on.
 
-It is preset ``fast`` where nothing is known. What follows from the data alone (box,
-resolution, samples, batch, activations) is fixed at first. Where there is time to ask, the
-model begins small, without directions and with tables of a quarter of the size, and
-:mod:`mi_nerf.training.growing` lets it grow while it trains.
+It is preset ``fast`` until something is known: the same model from the same seed. What follows
+from the data alone (box, resolution, samples, activations) is written down with its reason.
+Where there is time to ask, views are held back, and :mod:`mi_nerf.training.shaping` takes out,
+while the run goes on, what these views do not miss, or adds what they call for.
 
 The seed fixes all chance. But what a step costs is measured, so that another machine, or a
 busier one, may decide otherwise.
@@ -15,21 +15,18 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Any
 
-from ..base.machine import available_memory
 from ..data import Dataset
 from .config import TrainConfig, to_json, with_settings
 from .held_back import FEWEST_VIEWS
-from .model import carved_cells, field_config, resolved_octaves
+from .model import field_config
 from .plain import as_text, leaves
 from .presets import preset
+from .scaling import pixels_across, resolved, resolved_octaves
 
 SHORTEST_SECONDS = 55.0  # of a run that has time to ask questions
-SHORTEST_STEPS = 900  # likewise
-SMALL = "to begin with"  # how reasons begin of what may still grow
-SMALLER_TABLE = 2  # of the logarithm of its entries, to begin with
-_FEWEST_OCTAVES = 4  # of Fourier features, to begin with
-_MEMORY_SHARE = 0.125  # of the machine's, for what one step keeps
-_BYTES_PER_QUERY = 8192  # activations, their gradients, samples: generous for a narrow network
+SHORTEST_STEPS = 600  # likewise
+SO_FAR = "as in preset fast so far"  # the reason for what training may still change
+FEWEST_OCTAVES = 4  # of Fourier features, to begin with
 
 
 @dataclass(frozen=True)
@@ -39,6 +36,7 @@ class Decision:
     setting: str
     value: Any  # as JSON knows it
     reason: str
+    open: bool = False  # whether training may still change it
 
     def __str__(self) -> str:
         return f"{self.setting} = {as_text(self.value, '.4g')}: {self.reason}"
@@ -51,6 +49,11 @@ def record(decisions: list[Decision], new: Decision) -> None:
             decisions[place] = new
             return
     decisions.append(new)
+
+
+def is_open(decisions: Collection[Decision], setting: str) -> bool:
+    """Whether training may still change a setting."""
+    return any(d.setting == setting and d.open for d in decisions)
 
 
 @dataclass(frozen=True)
@@ -70,17 +73,15 @@ def choose(config: TrainConfig, dataset: Dataset, *, given: Collection[str] = ()
     """
     choice = _Settings(config, set(given) | _changed(config))
     _settle_data(choice, dataset)
-    field = field_config(choice.config, dataset)
-    cells = carved_cells(choice.config, dataset, field)
-    _settle_sampling(choice, float(cells.mean()))
-    _settle_beginning(choice, len(dataset))
+    _settle_sizes(choice, dataset)
+    _settle_questions(choice, len(dataset))
     return Choice(choice.config, choice.decisions)
 
 
 def decisions_in(record: dict[str, Any], config: TrainConfig) -> list[Decision]:
     """What ``config.json`` says was decided, as far as it agrees with a configuration.
 
-    A run that was killed may have grown after it last wrote down why.
+    A run that was killed may have changed its shape after it last wrote down why.
     """
     values = dict(leaves(to_json(config)))
     try:
@@ -95,13 +96,8 @@ def decisions_in(record: dict[str, Any], config: TrainConfig) -> list[Decision]:
     ]
 
 
-def may_grow(decisions: Collection[Decision], setting: str) -> bool:
-    """Whether a setting is still as small as a run began with."""
-    return any(d.setting == setting and d.reason.startswith(SMALL) for d in decisions)
-
-
 class _Settings:
-    """A configuration that takes shape."""
+    """A configuration that is being settled."""
 
     def __init__(self, config: TrainConfig, fixed: set[str]) -> None:
         self.config, self._fixed = config, fixed
@@ -111,11 +107,11 @@ class _Settings:
         """Whether the user has left all settings alone whose names begin so."""
         return not any(name.startswith(prefixes) for name in self._fixed)
 
-    def take(self, setting: str, value: Any, reason: str) -> None:
+    def take(self, setting: str, value: Any, reason: str, *, open_still: bool = False) -> None:
         """Settles one setting, unless the user has."""
         if self.open(setting):
             self.config = with_settings(self.config, [f"{setting}={as_text(value)}"])
-            record(self.decisions, Decision(setting, value, reason))
+            record(self.decisions, Decision(setting, value, reason, open_still))
 
 
 # ---- From the data alone ---------------------------------------------------------
@@ -147,84 +143,50 @@ def _settle_data(choice: _Settings, dataset: Dataset) -> None:
         choice.take("background", "random" if dataset.has_alpha else "white", alpha)
 
 
-def _settle_sampling(choice: _Settings, occupied: float) -> None:
-    """Strata a ray and queries a step."""
-    grid = choice.config.grid
-    if grid is not None and grid.finest is not None:
-        samples = min(strata(grid.finest, occupied), choice.config.sampling.batch)
-        choice.take(
-            "sampling.samples",
-            samples,
-            f"the grid has {grid.finest} vertices along the box, "
-            f"{occupied:.0%} of which may hold something",
-        )
-    memory = available_memory()
-    sampling = choice.config.sampling
-    batch = fitting_batch(sampling.batch, sampling.samples, memory)
-    choice.take(
-        "sampling.batch",
-        batch,
-        f"a step keeps {batch * _BYTES_PER_QUERY / 2**30:.2g} GiB at most "
-        f"of the machine's {memory / 2**30:.0f} GiB",
-    )
+def _settle_sizes(choice: _Settings, dataset: Dataset) -> None:
+    """What grows with the images, as for every preset."""
+    before = dict(leaves(to_json(choice.config)))
+    choice.config = config = resolved(choice.config, dataset)
+    assert config.box is not None  # any more
+    across = pixels_across(dataset, config.box[:3], config.box[3:])
+    for name, value in leaves(to_json(config)):
+        if before.get(name) is None and value is not None:
+            choice.take(name, value, f"{across:.0f} pixels across the box")
 
 
-def strata(finest: int, occupied: float) -> int:
-    """Strata a ray: one for two vertices of the finest grid, where not too much is evaluated.
-
-    Args:
-        finest: vertices along the box.
-        occupied: share of the box in which samples are evaluated at first.
-    """
-    affordable = 48 / max(occupied, 0.5)
-    return 64 if finest <= 128 else int(max(64, 16 * round(min(finest / 2, affordable) / 16)))
+# ---- What training will tell ------------------------------------------------------
 
 
-def fitting_batch(wanted: int, samples: int, memory: int) -> int:
-    """Queries a step that keep no more than a fair part of ``memory`` bytes; a ray's at least."""
-    while wanted > samples and wanted * _BYTES_PER_QUERY > _MEMORY_SHARE * memory:
-        wanted //= 2
-    return max(wanted, samples)
-
-
-def _settle_beginning(choice: _Settings, views: int) -> None:
-    """A small model where there is time for it to grow, else that of preset ``fast``."""
+def _settle_questions(choice: _Settings, views: int) -> None:
+    """What may still change, where there is time to ask."""
     config = choice.config
-    seconds, steps = config.max_seconds, config.steps
-    hurry = None
-    if seconds is not None and seconds < SHORTEST_SECONDS:
-        hurry = f"{seconds:g} s are too few to ask what else"
-    elif steps is not None and steps < SHORTEST_STEPS:
-        hurry = f"{steps} steps are too few to ask what else"
-    elif views < FEWEST_VIEWS:
-        hurry = f"{views} views, too few to hold any back"
-    elif config.sampling.fine:
-        hurry = "two networks do not grow"
     network, grid = config.network, config.grid
-    why = (
-        f"as in preset fast: {hurry}" if hurry else f"{SMALL}, light does not depend on directions"
-    )
-    directions = choice.open("network.view_d") and network.view_width >= network.width
-    if directions and network.view_dependent and (hurry or network.view_depth == 1):
-        choice.take("network.view_dependent", bool(hurry), why)
-        if not hurry:
-            choice.take("network.view_depth", 0, "without directions, no layers behind them")
+    hurry = _hurry(config, views)
+    why = SO_FAR if hurry is None else f"as in preset fast: {hurry}"
+    asks = hurry is None
+    if network.view_dependent and choice.open("network.view_d"):
+        choice.take("network.view_dependent", True, why, open_still=asks)
     if grid is not None and choice.open("grid"):
-        less = 0 if hurry else SMALLER_TABLE
-        why = f"as in preset fast: {hurry}" if hurry else f"{SMALL}, a quarter of preset fast's"
-        choice.take("grid.log2_entries", grid.log2_entries - less, why)
+        choice.take("grid.log2_entries", grid.log2_entries, why, open_still=asks)
     position = config.position
-    if grid is None and position is not None and choice.open("position") and not hurry:
-        why = f"{SMALL}; the images resolve {position.frequencies}"
-        choice.take("position.frequencies", min(position.frequencies, _FEWEST_OCTAVES), why)
-    if choice.open("network.depth", "network.skip"):
-        why = f"as in preset fast: {hurry}" if hurry else f"{SMALL}, as in preset fast"
-        choice.take("network.depth", network.depth, why)
-    choice.take(
-        "sampling.render_samples",
-        config.sampling.render_samples,
-        f"{SMALL}, as in preset fast; the trained field says how many it needs",
-    )
+    if grid is None and position is not None and choice.open("position") and asks:
+        few = min(position.frequencies, FEWEST_OCTAVES)
+        why_few = f"to begin with; the images resolve {position.frequencies}"
+        choice.take("position.frequencies", few, why_few, open_still=True)
+    strata = config.sampling.render_samples
+    choice.take("sampling.render_samples", strata, SO_FAR, open_still=True)
+
+
+def _hurry(config: TrainConfig, views: int) -> str | None:
+    """Why nothing can be asked, if so."""
+    seconds, steps = config.max_seconds, config.steps
+    if seconds is not None and seconds < SHORTEST_SECONDS:
+        return f"{seconds:g} s are too few to ask what else"
+    if steps is not None and steps < SHORTEST_STEPS:
+        return f"{steps} steps are too few to ask what else"
+    if views < FEWEST_VIEWS:
+        return f"{views} views, too few to hold any back"
+    return "two networks keep their shape" if config.sampling.fine else None
 
 
 def _changed(config: TrainConfig) -> set[str]:

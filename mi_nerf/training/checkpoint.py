@@ -77,7 +77,7 @@ def save_checkpoint(path: str | Path, trainer: Trainer, progress: Progress) -> N
     All randomness of a step follows from the seed and the step number, so no random
     state has to be kept besides them.
     """
-    arrays = {f"weights.{n}": np.array(t) for n, t in trainer.parameters.items()}
+    arrays = {f"weights.{n}": np.asarray(t) for n, t in trainer.parameters.items()}
     arrays |= {f"adam.{n}": a for n, a in trainer.optimizer.state().items()}
     if trainer.occupancy is not None:
         arrays |= {f"occupancy.{n}": a for n, a in trainer.occupancy.state().items()}
@@ -151,7 +151,8 @@ def _require_same_settings(path: str | Path, description: Description, trainer: 
         before = to_json(from_json(description.settings, str(path)))
     found, wanted = dict(leaves(now)), dict(leaves(before))
     for name in sorted(found.keys() | wanted.keys()):
-        if name not in _FREE and found.get(name) != wanted.get(name):
+        older = name == "box" and wanted.get(name) is None  # was found, and not written down
+        if name not in _FREE and found.get(name) != wanted.get(name) and not older:
             raise InputError(
                 f"{path}: does not fit this run: it was trained with {name}="
                 f"{as_text(wanted.get(name))}, expected {as_text(found.get(name))} as in the run"

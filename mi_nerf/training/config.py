@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import json
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ..base.errors import InputError, Option
 from ..fields.activations import ColorActivation, DensityActivation
@@ -16,6 +16,16 @@ from ..fields.hash_grid import HashGridConfig
 from ..fields.network import NetworkConfig
 from ..march.rules import Rule
 from .plain import assign, build, leaf_names, require
+
+if TYPE_CHECKING:  # what code sees that works with settings: they are resolved before
+    Found = int
+else:  # what may be set; none: found from the data (mi_nerf.training.scaling)
+    Found = int | None
+FROM_DATA: Any = None
+
+# Queries whose gradients may be added up in half precision. Of more, the sums lose their digits:
+# the error of a weight's gradient is 1 % with these, 14 % with four times as many.
+HALF_BLOCK = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -38,11 +48,11 @@ class OccupancyConfig:
 
     enabled: bool = True  # false: samples are evaluated everywhere in the box
     hull: bool = True  # start from the silhouettes, where images have alpha
-    resolution: int = 64  # cells along the longest side of the box
+    resolution: Found = 64  # cells along the longest side of the box; none: by the images
     threshold: float = 0.01  # optical thickness of a cell below which it counts as empty
     decay: float = 0.9  # of remembered densities, at each refresh of a cell
     every: int = 16  # steps between refreshes
-    queries: int = 8192  # cells looked at in one refresh
+    queries: Found = 8192  # cells looked at in one refresh; none: by the images
     start: int = 256  # steps before the first refresh
 
     def __post_init__(self) -> None:
@@ -55,11 +65,11 @@ class OccupancyConfig:
 class SamplingConfig:
     """Rays and the samples on them."""
 
-    samples: int = 64  # strata a ray in training
+    samples: Found = 64  # strata a ray in training; none: by the images
     fine: int = 0  # samples more, where a second, coarse network sees something (0: no such)
-    render_samples: int = 128  # strata a ray in evaluation, and what the field file suggests
+    render_samples: Found = 128  # strata in evaluation and for the field file; none: by the images
     render_fine: int | None = None  # samples more in evaluation; none: as in training
-    batch: int = 32768  # field queries a step, at most
+    batch: Found = 32768  # field queries a step, at most; none: by the features
     max_rays: int = 16384  # rays a step, at most
     render_stop: float = 1e-3  # transmittance at which a ray ends in evaluation; 0: never
     rays: int | None = None  # rays a step; none: as many as fill the batch
@@ -74,7 +84,8 @@ class SamplingConfig:
         require(self, "near fine render_fine hidden", at_least=0)
         require(self, "far", above=0)
         require(self, "render_stop", at_least=0, below=1)
-        if self.batch < self.samples:
+        known = None not in (self.batch, self.samples)
+        if known and self.batch < self.samples:
             raise ValueError(
                 f"batch={self.batch}, expected at least the samples={self.samples} of one ray"
             )
@@ -83,11 +94,31 @@ class SamplingConfig:
 
 
 @dataclass(frozen=True)
+class PyramidConfig:
+    """Coarse images first: level l of the pyramid averages 2^l×2^l pixels.
+
+    The level falls evenly from the coarsest to that of the images themselves. Between two
+    levels, either is drawn for its share of the rays.
+    """
+
+    levels: int | None = 0  # coarser than the images; none: by their size
+    until: float = 0.4  # share of the budget after which the images themselves are seen
+    mixed: float = 0.0  # share of rays that see any level, at any time
+    jitter: bool = False  # rays anywhere through a coarse pixel; false: through its middle
+    features: bool = False  # a level of the grid joins when the images resolve it
+
+    def __post_init__(self) -> None:
+        require(self, "levels", at_least=0, at_most=12)
+        require(self, "until mixed", at_least=0, at_most=1)
+
+
+@dataclass(frozen=True)
 class OptimizerConfig:
-    """Adam with warm-up and exponential decay."""
+    """Adam with warm-up and decay."""
 
     lr: float = 5e-4  # learning rate after warm-up
     lr_final: float = 5e-5  # learning rate at the end of the schedule
+    schedule: Literal["exponential", "cosine", "linear"] = "exponential"  # between the two
     warmup: int = 100  # steps of linear increase
     beta1: float = 0.9  # decay of the mean gradient
     beta2: float = 0.99  # decay of the mean squared gradient
@@ -95,7 +126,10 @@ class OptimizerConfig:
     muon: bool = False  # orthogonal updates of matrices between hidden layers, in place of Adam
 
     def __post_init__(self) -> None:
-        require(self, "lr lr_final epsilon", above=0)
+        require(self, "lr epsilon", above=0)
+        require(self, "lr_final", at_least=0)
+        if self.schedule == "exponential":  # never reaches 0
+            require(self, "lr_final", above=0)
         require(self, "warmup", at_least=0)
         require(self, "beta1 beta2", at_least=0, below=1)
 
@@ -125,6 +159,7 @@ class TrainConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     occupancy: OccupancyConfig = field(default_factory=OccupancyConfig)
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    pyramid: PyramidConfig = field(default_factory=PyramidConfig)
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     report_every: float = 2.0  # seconds between lines of the log
     checkpoint_every: float = 60.0  # seconds between checkpoints
@@ -148,6 +183,12 @@ class TrainConfig:
         if self.half_precision and widest > WIDEST:
             raise ValueError(
                 f"half_precision=true with {widest} neurons a layer, expected {WIDEST} at most"
+            )
+        together = min(self.sampling.block, self.sampling.batch or self.sampling.block)
+        if self.half_precision and together > HALF_BLOCK:
+            raise ValueError(
+                f"half_precision=true with block={self.sampling.block}, expected {HALF_BLOCK} at "
+                "most: sums of more gradients lose their digits"
             )
         box = self.box or (0, 0, 0, 1, 1, 1)
         if not all(box[i] < box[i + 3] for i in range(3)):

@@ -10,15 +10,14 @@ import drjit as dr
 import numpy as np
 
 from ..base.arrays import vector3_type
-from ..data import Dataset
+from ..data import Dataset, evenly_spread_indices
 from ..fields.neural import NeuralField
 from ..fields.protocol import Field
-from .batches import RaySource, step_rng
 from .config import TrainConfig
 from .trainer import Trainer
 
 FEWEST_VIEWS = 5  # with fewer there is none to hold back
-_MOST_VIEWS = 8  # to hold back
+_MOST_VIEWS, _ONE_OF = 8, 8  # to hold back: one of so many
 _PIXELS = 8192  # held-back ones that judge a field, at most
 _DIRECTIONS = 8  # from which light is averaged
 _EVEN_PIXELS = 4096  # for that, at most
@@ -33,18 +32,15 @@ class HeldBack:
         Args:
             trainer: whose field is judged; it still learns from all views of ``dataset``.
         """
-        count = min(_MOST_VIEWS, max(1, len(dataset) // FEWEST_VIEWS))
-        held = [(2 * i + 1) * len(dataset) // (2 * count) for i in range(count)]
-        self._all, self._trainer, self.holds = dataset, trainer, False
-        self.views = dataset.subset(held)
-        self.others = dataset.subset([i for i in range(len(dataset)) if i not in held])
-        float_type = type(next(iter(trainer.parameters.values())).array)
-        source = RaySource(self.views, trainer.background, float_type)
+        count = min(_MOST_VIEWS, max(1, len(dataset) // _ONE_OF))
+        self.views = [(2 * i + 1) * len(dataset) // (2 * count) for i in range(count)]
+        self.others = sorted(set(range(len(dataset))) - set(self.views))
+        self._trainer, self.holds = trainer, False
+        self._cameras = dataset.cam_to_world[self.others, :3, 3]
         size = dataset.intrinsics
         most = count * size.width * size.height
         self._pixels, self._few = (
-            source.draw(min(n, most), step_rng(float_type, _SEED, 0))
-            for n in (_PIXELS, _EVEN_PIXELS)
+            trainer.pixels_of(self.views, min(n, most), _SEED) for n in (_PIXELS, _EVEN_PIXELS)
         )
 
     def hold(self) -> None:
@@ -54,7 +50,7 @@ class HeldBack:
 
     def give_back(self) -> None:
         """Lets the trainer learn from all views again."""
-        self._trainer.learn_from(self._all)
+        self._trainer.learn_from()
         self.holds = False
 
     def quality(self, *, samples: int | None = None) -> float:
@@ -83,7 +79,8 @@ class HeldBack:
         if field.ndc is not None:  # where cameras have no place among positions
             blind = dataclasses.replace(network, view_dependent=False)
             return self.lost_as(dataclasses.replace(config, network=blind))
-        cameras = self.others.evenly_spread(_DIRECTIONS).cam_to_world[:, :3, 3]
+        some = evenly_spread_indices(len(self._cameras), _DIRECTIONS)
+        cameras = self._cameras[some]
         even = trainer.validate(self._few, _EvenLight(field, cameras))
         return _decibels(trainer.validate(self._few)) - _decibels(even)
 

@@ -9,7 +9,7 @@ decision is taken on the device.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping
 from typing import Any
 
 import drjit as dr
@@ -23,6 +23,23 @@ from .orthogonal import is_hidden, orthogonalized, update_size
 def _choose(mask: Any, a: Any, b: Any) -> Any:
     """A tensor of the entries of ``a`` where the flat ``mask`` holds, else of ``b``."""
     return type(a)(dr.select(mask, a.array, b.array), shape=b.shape)
+
+
+def _finite_squares(gradients: Iterable[Any]) -> Any:
+    """A mask of one element: whether the square of every entry is a number of single precision.
+
+    Each gradient is read once and nothing of its size written, as a sum of squares would: only
+    entries that fail are scattered, all to one place.
+    """
+    failed, kept = None, list(gradients)
+    dr.eval(kept)
+    for g in kept:
+        flat = g.array
+        uint = dr.uint32_array_t(type(flat))
+        if failed is None:
+            failed = dr.zeros(uint, 1)
+        dr.scatter(failed, uint(1), uint(0), ~dr.isfinite(dr.square(flat)))
+    return failed == 0
 
 
 class JointParameters(MutableMapping[str, Any]):
@@ -87,9 +104,7 @@ class Adam:
             A mask of one element: whether the step was taken.
         """
         gradients = {n: dr.grad(p) for n, p in self._parameters.items()}
-        dr.eval(gradients)
-        norm = sum(dr.sum(dr.square(g.array)) for g in gradients.values())
-        accept = accept & dr.isfinite(norm)
+        accept = accept & _finite_squares(gradients.values())
         self._steps = self._steps + dr.select(accept, type(self._steps)(1), 0)
         rate = self._debiased_rate(learning_rate)
         dr.eval(rate, self._steps, accept)
@@ -112,9 +127,9 @@ class Adam:
         return accept
 
     def state(self) -> dict[str, np.ndarray[Any, Any]]:
-        """Moments and step count, by name."""
-        result = {f"first.{n}": np.array(t) for n, t in self._first.items()}
-        result |= {f"second.{n}": np.array(t) for n, t in self._second.items()}
+        """Moments and step count, by name; on the CPU where they lie, without a copy."""
+        result = {f"first.{n}": np.asarray(t) for n, t in self._first.items()}
+        result |= {f"second.{n}": np.asarray(t) for n, t in self._second.items()}
         result["steps"] = np.array(self._steps)
         return result
 

@@ -8,7 +8,20 @@ from ..base.errors import InputError
 from ..fields.fourier import FourierEncoding
 from ..fields.hash_grid import HashGridConfig
 from ..fields.network import NetworkConfig
-from .config import DensityConfig, OccupancyConfig, OptimizerConfig, SamplingConfig, TrainConfig
+from .config import (
+    FROM_DATA,
+    DensityConfig,
+    OccupancyConfig,
+    OptimizerConfig,
+    PyramidConfig,
+    SamplingConfig,
+    TrainConfig,
+)
+
+# Sizes that follow the images: mi_nerf.training.scaling.
+_OCCUPANCY = OccupancyConfig(resolution=FROM_DATA, queries=FROM_DATA)
+_SAMPLING = SamplingConfig(samples=FROM_DATA, render_samples=FROM_DATA, batch=FROM_DATA)
+_PYRAMID = PyramidConfig(levels=None)
 
 
 def nerf() -> TrainConfig:
@@ -18,8 +31,9 @@ def nerf() -> TrainConfig:
         network=NetworkConfig(depth=2, width=256, skip=-1, feature_layer=False, view_width=32),
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
-        occupancy=OccupancyConfig(resolution=96, queries=16384),
-        sampling=SamplingConfig(batch=4096),
+        occupancy=_OCCUPANCY,
+        sampling=_SAMPLING,
+        pyramid=_PYRAMID,
         optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, muon=True),
     )
 
@@ -30,10 +44,12 @@ def fast() -> TrainConfig:
         preset="fast",
         network=NetworkConfig(depth=1, width=64, skip=-1, feature_layer=False, view_width=64),
         position=FourierEncoding(frequencies=0),
-        grid=HashGridConfig(),
+        grid=HashGridConfig(log2_entries=None),
         direction=FourierEncoding(frequencies=2),
         density=DensityConfig(gain=10.0),
-        sampling=SamplingConfig(batch=16384, hidden=10.0),
+        occupancy=_OCCUPANCY,
+        sampling=replace(_SAMPLING, hidden=10.0),
+        pyramid=_PYRAMID,
         optimizer=OptimizerConfig(lr=1e-2, lr_final=1e-3, epsilon=1e-15),
     )
 

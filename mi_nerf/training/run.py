@@ -31,7 +31,8 @@ from ..march.view import View, display_image, render_view
 from .auto import Choice, Decision, choose, decisions_in
 from .checkpoint import Progress, load_checkpoint, read_checkpoint, save_checkpoint
 from .config import TrainConfig, from_json, to_json
-from .growing import Growing
+from .device import for_device
+from .forecast import PUBLISHED_STEPS, Forecast, forecast
 from .progress import Meter, ProgressBar
 from .run_folder import (
     CHECKPOINT,
@@ -43,7 +44,9 @@ from .run_folder import (
     read_config,
     read_record,
 )
+from .scaling import summary
 from .schedule import learning_rate
+from .shaping import Shaping
 from .trainer import StepResult, Trainer
 
 
@@ -70,13 +73,15 @@ class Run:
                 count while :meth:`reports` is at work.
             trainer: of this configuration and dataset, in place of a new one.
         """
-        self.folder, self.config, self.variant = folder, config, variant
+        self.folder, self.variant = folder, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
+        self.forecast: Forecast | None = None  # of a new run with a published schedule
         self.interrupted = False  # by Ctrl-C, when last trained
         self._started = started  # None: the clock stands still,
         self._paused = time.monotonic()  # since then
         self.trainer = trainer or Trainer(config, dataset, array_module(variant))
-        self._growing: Growing | None = None
+        self.config = self.trainer.config  # with what follows from the data
+        self._shaping: Shaping | None = None
         self._record: dict[str, Any] = {}  # what config.json holds
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before the clock was last started
@@ -105,13 +110,19 @@ class Run:
             shares.append(self.seconds / self.config.max_seconds)
         return min(1.0, max(shares))
 
-    def grow(self, dataset: Dataset, decisions: list[Decision]) -> None:
-        """Lets the model grow while it trains; ``decisions`` say why it is what it is so far."""
+    @property
+    def sizes(self) -> str:
+        """What is trained, in a line: features, cells, strata, and how much memory they take."""
+        trainer = self.trainer
+        return summary(self.config, trainer.field_config, trainer.image_bytes)
+
+    def shape(self, dataset: Dataset, decisions: list[Decision]) -> None:
+        """Lets the model take shape while it trains; ``decisions`` say why it is what it is."""
         self.decisions = decisions
-        self._growing = Growing(self.trainer, dataset, decisions, lambda: self.progress)
+        self._shaping = Shaping(self.trainer, dataset, decisions, lambda: self.progress)
 
     def keep_record(self, record: dict[str, Any]) -> None:
-        """Writes ``config.json``, now and whenever the configuration has grown."""
+        """Writes ``config.json``, now and whenever the run is saved in another shape."""
         self._record = record
         write_json(self.folder / CONFIG, record)
 
@@ -168,8 +179,8 @@ class Run:
                 self._advance()
                 if self._collapsed():
                     self._restart()
-                if self._growing is not None and self._growing.after_step():
-                    self._note_growth()
+                if self._shaping is not None and self._shaping.after_step():
+                    self._note_shape()
                 now = self.seconds
                 self.interrupted = bool(stop)
                 finished = self.progress >= 1 or self.interrupted
@@ -217,9 +228,9 @@ class Run:
         progress = Progress(self.seconds, self._skipped, self._attempt_start, self._begun)
         save_checkpoint(self.folder / CHECKPOINT, self.trainer, progress)
         save_field(self.folder / FIELD, self.field_file())
-        if self._growing is not None and self._record:
-            # Last: a checkpoint that has grown more counts, see _resumed_config.
-            self.keep_record(self._grown_record())
+        if self._shaping is not None and self._record:
+            # Last: a checkpoint in another shape counts, see _resumed_config.
+            self.keep_record(self._present_record())
 
     def field_file(self) -> FieldFile:
         """The field as it is now, as XML scenes will load it."""
@@ -284,12 +295,10 @@ class Run:
 
     def _advance(self) -> None:
         """Launches a step, then reads the results of the one before."""
-        rate = learning_rate(
-            self.config.optimizer,
-            self.progress,
-            self.trainer.step_count - self._attempt_start,
-        )
-        result = self.trainer.step(rate)
+        progress, age = self.progress, self.trainer.step_count - self._attempt_start
+        rate = learning_rate(self.config.optimizer, progress, age)
+        ends = self.config.steps or self.config.max_seconds  # else images are sharp at once
+        result = self.trainer.step(rate, progress if ends else 1.0)
         self._settle()
         self._pending = result
         self._rate = rate
@@ -323,15 +332,15 @@ class Run:
                 f"{self.trainer.step_count}; try a larger sampling.batch or fewer sampling.rays"
             )
 
-    # ----------------------------------- Growth -----------------------------------
+    # ----------------------------------- Shape -----------------------------------
 
-    def _note_growth(self) -> None:
+    def _note_shape(self) -> None:
         """Goes on with the configuration that the trainer has by now."""
         config, budget = self.trainer.config, self.config
         self.config = replace(config, steps=budget.steps, max_seconds=budget.max_seconds)
         self._blank = self.trainer.blank_loss
 
-    def _grown_record(self) -> dict[str, Any]:
+    def _present_record(self) -> dict[str, Any]:
         """What ``config.json`` holds by now; its budget stays what the run began with."""
         budget = {n: self._record["settings"].get(n) for n in ("steps", "max_seconds")}
         field = {
@@ -407,10 +416,12 @@ def start(
     ``max_seconds`` of ``config`` take its place, where given. Seconds count from ``started``,
     or else while this function and :meth:`Run.reports` are at work. A run with preset
     ``auto`` chooses its model, in part while it trains; settings named in ``given`` or unlike
-    the preset's are kept.
+    the preset's are kept. A new one with a preset that has a published schedule first measures
+    how long that takes, and follows it if it has no budget.
 
     Raises:
-        InputError: if the folder already holds a run, or the data cannot be read.
+        InputError: if the folder already holds a run, the data cannot be read, or a published
+            schedule that nobody asked for would take days.
     """
     folder = Path(out)
     clock = time.monotonic() if started is None else started
@@ -422,8 +433,15 @@ def start(
     elif (folder / CONFIG).exists() or (folder / CHECKPOINT).exists():
         resuming = Option("resume", True)
         raise InputError("{}: already holds a run, expected {} or another folder", folder, resuming)
+    if not recorded:
+        config = for_device(config, variant, given)
     check_folder(folder)
     dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
+    expected = None
+    if config.preset in PUBLISHED_STEPS and not recorded:
+        expected = forecast(config, dataset, array_module(variant))
+        if config.steps is None and config.max_seconds is None:
+            config = replace(config, steps=PUBLISHED_STEPS[config.preset])
     choice = Choice(config, [])
     if config.preset == "auto":
         choice = (
@@ -432,13 +450,14 @@ def start(
             else choose(config, dataset, given=given)
         )
     run = Run(folder, choice.config, dataset, variant, started=clock)
+    run.forecast = expected
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
         run.resume()
     else:
         (folder / LOG).unlink(missing_ok=True)
     if choice.decisions:
-        run.grow(dataset, choice.decisions)
+        run.shape(dataset, choice.decisions)
     if recorded:
         run.keep_record(read_record(folder))
     else:
@@ -454,11 +473,11 @@ def _resumed_config(folder: Path, given: TrainConfig, data: str | Path) -> Train
     if Path(recorded) != Path(data).resolve():
         raise InputError(f"{data}: expected {recorded}, on which the run in {folder} was trained")
     if config.preset == "auto" and (folder / CHECKPOINT).exists():
-        # It may have grown after config.json was last written.
+        # It may have another shape than when config.json was last written.
         _, description = read_checkpoint(folder / CHECKPOINT)
         if description.settings is not None:
-            grown = from_json(description.settings, str(folder / CHECKPOINT))
-            config = replace(grown, steps=config.steps, max_seconds=config.max_seconds)
+            shaped = from_json(description.settings, str(folder / CHECKPOINT))
+            config = replace(shaped, steps=config.steps, max_seconds=config.max_seconds)
     if given.steps is not None or given.max_seconds is not None:
         config = replace(config, steps=given.steps, max_seconds=given.max_seconds)
     return config

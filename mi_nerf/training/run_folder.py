@@ -20,7 +20,7 @@ CONFIG, CHECKPOINT, FIELD, LOG = (
 
 
 # Version of config.json: a setting or key that is added needs the next one. 0.1.0 wrote none.
-FORMAT: dict[str, Any] = {"kind": "mi_nerf.run", "version": 1}
+FORMAT: dict[str, Any] = {"kind": "mi_nerf.run", "version": 2}
 
 
 def read_config(folder: Path) -> tuple[TrainConfig, dict[str, Any]]:

@@ -51,12 +51,9 @@ class Level:
 def levels(config: HashGridConfig) -> list[Level]:
     """The levels of a grid, coarse to fine."""
     found, first, octaves = [], 0, math.log2(config.growth())
-    for number in range(config.levels):
+    for number, entries in enumerate(config.level_entries()):
         scale = 2.0 ** (number * octaves) * config.coarsest - 1
-        side = math.ceil(scale) + 1
-        entries = -(-(side**3) // config.features) * config.features
-        entries = min(entries, 1 << config.log2_entries)
-        found.append(Level(scale, side, first, entries))
+        found.append(Level(scale, math.ceil(scale) + 1, first, entries))
         first += entries
     return found
 

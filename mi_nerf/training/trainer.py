@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +32,8 @@ from .loss_scale import LossScale
 from .losses import LOSSES, squared_error
 from .model import carved_cells, field_config
 from .optimizer import Adam, JointParameters
+from .scaling import resolved
+from .schedule import grid_level_weights, image_level
 
 _FEWEST_RAYS = 8  # in a step
 _BYTES_PER_SAMPLE = 100  # parameter, width, density, colour, weight, and their adjoints
@@ -123,11 +125,18 @@ class Trainer:
             backend: ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
             cells: those that may hold something, (X, Y, Z) booleans; found if not given.
         """
+        config = resolved(config, dataset)
         self.config, self._backend = config, backend
         self.field_config = field_config(config, dataset)
         self._hull = carved_cells(config, dataset, self.field_config) if cells is None else cells
         _require_memory(config)
-        self.learn_from(dataset)
+        self.background = config.background
+        if self.background == "auto":
+            self.background = "random" if dataset.has_alpha else "white"
+        self._noise_level = 0.0 if dataset.has_alpha else config.density.noise
+        self._images = RaySource(dataset, self.background, backend.Float, config.pyramid)
+        self.blank_loss = blank_loss(dataset, self.background, config.pyramid.levels or 0)
+        self.learn_from()
         loss = config.loss
         if loss == "auto":
             loss = "mse" if dataset.color_space == "srgb" else "relative"
@@ -137,15 +146,13 @@ class Trainer:
         self.rays_per_step = 0.0
         self.reset()
 
-    def learn_from(self, dataset: Dataset) -> None:
-        """Takes the rays of further steps from ``dataset``, a scene in the same box."""
-        background = self.config.background
-        if background == "auto":
-            background = "random" if dataset.has_alpha else "white"
-        self._noise_level = 0.0 if dataset.has_alpha else self.config.density.noise
-        self.background = background
-        self._source = RaySource(dataset, background, self._backend.Float)
-        self.blank_loss = blank_loss(dataset, background)
+    def learn_from(self, views: Sequence[int] | None = None) -> None:
+        """Takes the rays of further steps from these views of the dataset alone; none: all."""
+        self._source = self._images if views is None else self._images.of_views(views)
+
+    def pixels_of(self, views: Sequence[int], count: int, seed: int) -> RayBatch:
+        """Random pixels of some views, those of the images themselves."""
+        return self._images.of_views(views).draw(count, step_rng(self._backend.Float, seed, 0))
 
     def reset(self) -> None:
         """Fresh weights, moments and occupancy, from the seed and the attempt."""
@@ -236,6 +243,11 @@ class Trainer:
             features = self.field_config.direction.features(batch.d)
             return np.array([float(dr.mean(f)[0]) for f in features], np.float32)
 
+    @property
+    def image_bytes(self) -> int:
+        """Memory that the pixels take on the device."""
+        return self._images.nbytes
+
     def march_settings(self) -> MarchSettings:
         """How rays are sampled in training."""
         s = self.config.sampling
@@ -248,9 +260,14 @@ class Trainer:
             block=min(s.block, s.batch),
         )
 
-    def step(self, learning_rate: float) -> StepResult:
-        """One optimisation step. Launches work; reads nothing back but sample counts."""
-        drawn = self._draw()
+    def step(self, learning_rate: float, progress: float = 1.0) -> StepResult:
+        """One optimisation step. Launches work; reads nothing back but sample counts.
+
+        Args:
+            progress: share of the run's budget that is spent: how sharp the images are.
+        """
+        self._weigh_levels(progress)
+        drawn = self._draw(image_level(self.config.pyramid, progress))
         found = self._differentiate(drawn)
         accepted = self._update(learning_rate, found.loss)
         self._adapt_rays(drawn.rays, found.wanted)
@@ -276,14 +293,14 @@ class Trainer:
 
     # ---------------------------- The phases of a step ------------------------------
 
-    def _draw(self) -> _Drawn:
-        """Random rays and offsets of their samples, which follow from seed and step alone."""
+    def _draw(self, level: float = 0.0) -> _Drawn:
+        """Random rays and offsets of their samples: they follow from seed, step and level."""
         config, float_type, rays = self.config, self._backend.Float, self._ray_count()
         rng = step_rng(float_type, config.seed, self.step_count)
         crop = config.crop if self.step_count < config.crop_steps else 1.0
         fine = config.sampling.fine
         with stage("rays"):
-            batch = self._source.draw(rays, rng, crop)
+            batch = self._source.draw(rays, rng, crop, level)
             jitter = rng.random(float_type, rays * config.sampling.samples)
             fine_jitter = rng.random(float_type, rays * fine) if fine else float_type()
             dr.eval(jitter, fine_jitter)
@@ -313,6 +330,16 @@ class Trainer:
         with stage("occupancy"):
             self._refresh_occupancy()
         return accepted
+
+    def _weigh_levels(self, progress: float) -> None:
+        """Levels of the grid join as the images come to resolve them."""
+        grid, pyramid = self.field_config.grid, self.config.pyramid
+        if grid is None or not pyramid.features or not pyramid.levels:
+            return
+        weights = self._backend.Float(grid_level_weights(pyramid, grid, progress))
+        self.field.level_weights = weights
+        if self.field.coarse is not None:
+            self.field.coarse.level_weights = weights
 
     # ------------------------------ Differentiation ---------------------------------
 

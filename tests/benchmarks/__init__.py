@@ -1,4 +1,8 @@
-"""Measurements; each module is one command and prints one table.
+"""Measurements; each module is one command, prints what it finds and writes it to docs/results.
+
+``results`` holds the files, ``tables`` takes them to the documents, ``note`` writes down what
+another command has measured, and ``all`` measures again what is out of date. Raw records of other
+formats belong into a folder of their own below docs/results.
 
 They need no more than the package and, where they say so, the folder of datasets that
 the variable MI_NERF_DATA names. Run them on an otherwise idle machine.

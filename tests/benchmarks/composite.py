@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,10 @@ import mi_nerf
 from mi_nerf.base.variants import choose_variant
 from mi_nerf.fields.network import NetworkConfig, initial_weights
 from mi_nerf.fields.neural import NeuralFieldConfig
+from mi_nerf.march import query, walk
 from mi_nerf.march.settings import MarchSettings
-from mi_nerf.plugins import crossing
 from tests.benchmarks import machine
+from tests.benchmarks.results import RENDERING, Figure, Row, add_options, save
 from tests.support.fields import camera_dict
 
 _WIDTH, _PATHS = 256, 64
@@ -39,18 +41,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--repeats", type=int, default=7)
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
     variant = choose_variant(options.variant)
     mi.set_variant(variant)
     print(f"{machine()}, {variant}, {_WIDTH}x{_WIDTH} pixels")
     with tempfile.TemporaryDirectory() as folder:
         file = _field_file(Path(folder))
-        _against_none(file, options.repeats)
-        _by_number(file, options.repeats)
-        _light_transport(file, options.repeats)
+        beside = [*_against_none(file, options.repeats), *_by_number(file, options.repeats)]
+        transport = list(_light_transport(file, options.repeats))
+    parts = (*RENDERING, "estimators")
+    save("composite", beside, options, variant, parts, whole=True)
+    save("light_transport", transport, options, variant, parts, whole=True)
 
 
-def _against_none(file: Path, repeats: int) -> None:
+def _against_none(file: Path, repeats: int) -> Iterator[Row]:
     """A room with an object that covers a tenth of the pixels, and without it."""
     field = _cube(file, mi.ScalarTransform4f().translate([0.2, 0, -0.4]).scale(0.88))
     path = _seconds(mi.load_dict(_room({"type": "path"})), _PATHS, repeats)[0]
@@ -65,22 +70,42 @@ def _against_none(file: Path, repeats: int) -> None:
             f"them: {seconds:.3f} s, {seconds / path:.2f} times, "
             f"{queries / 1e6:.2f} million queries"
         )
+        yield Row(
+            {
+                "what": f"a field over {(opacity > 0).mean():.1%} of the pixels, {_PATHS} paths "
+                f"and {spp} rays a pixel, against the scene without it"
+            },
+            {
+                "seconds": Figure(seconds, "s"),
+                "times": Figure(seconds / path),
+                "million_queries": Figure(queries / 1e6),
+            },
+        )
 
 
-def _by_number(file: Path, repeats: int) -> None:
+def _by_number(file: Path, repeats: int) -> Iterator[Row]:
     """Fields beside each other, and all in one place."""
     for name in ("side by side", "overlapping"):
         for count in (1, 2, 4, 8):
             cubes = {f"field_{i}": _cube(file, _place(name, i)) for i in range(count)}
             scene = mi.load_dict(_room({"type": "nerf"}, **cubes))
             seconds, queries = _seconds(scene, 1, repeats)
+            a_million = 1e6 * seconds / queries if queries else float("nan")
             print(
                 f"{count} {name}: {seconds:.3f} s, {queries / 1e6:.2f} million queries, "
-                f"{1e6 * seconds / queries:.3f} s a million"
+                f"{a_million:.3f} s a million"
+            )
+            yield Row(
+                {"what": f"{count} fields, {name}"},
+                {
+                    "seconds": Figure(seconds, "s"),
+                    "million_queries": Figure(queries / 1e6),
+                    "seconds_a_million": Figure(a_million, "s"),
+                },
             )
 
 
-def _light_transport(file: Path, repeats: int) -> None:
+def _light_transport(file: Path, repeats: int) -> Iterator[Row]:
     """Paths through a field, beside paths that do not know it, and how noisy both are.
 
     Noise is the mean over all pixels of the variance between renderings; times seconds, it is
@@ -113,6 +138,14 @@ def _light_transport(file: Path, repeats: int) -> None:
                 f"{seconds:.3f} s, {queries / 1e6:.2f} million queries, variance {noise:.2e}, "
                 f"times seconds {noise * seconds:.2e}"
             )
+            yield Row(
+                {"light": "lamp and sky" if lit else "the field alone", "integrator": name},
+                {
+                    "seconds": Figure(seconds, "s"),
+                    "million_queries": Figure(queries / 1e6),
+                    "variance": Figure(noise),
+                },
+            )
 
 
 def _place(name: str, i: int) -> Any:
@@ -128,27 +161,44 @@ def _seconds(scene: mi.Scene, spp: int, repeats: int) -> tuple[float, int]:
     """Median time of a rendering and its queries."""
     times, queries = [], 0
     for seed in range(repeats + 1):
-        counter = _CountedEvaluation
-        counter.queries = 0
+        _Counted.queries = 0
         start = time.perf_counter()
         dr.eval(mi.render(scene, spp=spp, seed=seed))
         dr.sync_thread()
         times.append(time.perf_counter() - start)
-        queries = counter.queries
+        queries = _Counted.queries
     return float(np.median(times[1:])), queries
 
 
-class _CountedEvaluation(crossing.Evaluation):
-    """Counts what the fields are asked."""
+class _Counted:
+    """Counts what the fields are asked, wherever; plugins are loaded anew with each variant."""
 
     queries = 0
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        _CountedEvaluation.queries += len(self.asked)
+
+def _count(make: Callable[..., None]) -> Callable[..., None]:
+    def counting(self: query.Evaluation, *arguments: Any, **options: Any) -> None:
+        make(self, *arguments, **options)
+        _Counted.queries += len(self.asked)
+
+    return counting
 
 
-crossing.Evaluation = _CountedEvaluation  # type: ignore
+query.Evaluation.__init__ = _count(query.Evaluation.__init__)  # type: ignore[method-assign]
+
+
+def _count_walks(make: Callable[..., Any]) -> Callable[..., Any]:
+    """The same of fields that are asked within one kernel."""
+
+    def counting(*arguments: Any, **options: Any) -> Any:
+        walked = make(*arguments, **options)
+        _Counted.queries += int(dr.sum(walked.queries)[0])
+        return walked
+
+    return counting
+
+
+walk.walk_rays = _count_walks(walk.walk_rays)  # before the plugins are imported anew
 
 
 def _field_file(folder: Path) -> Path:

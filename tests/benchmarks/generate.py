@@ -37,6 +37,7 @@ from mi_nerf.images.write import on_white
 from mi_nerf.scene_xml.library import find_scene
 from mi_nerf.scene_xml.scene_file import SceneFile
 from tests.benchmarks import machine
+from tests.benchmarks.results import GENERATION, Figure, Row, add_options, mean_of, median_of, save
 
 _BARE_LOOP = """
 import sys
@@ -68,17 +69,23 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
     variant = choose_variant(options.variant)
     print(f"{machine()}, {variant}, mi_nerf {mi_nerf.__version__}")
     print(f"{options.scene}, {options.views} views of {options.size}^2, {options.spp} spp")
-    _kernels(options, variant)  # first: what follows fills the kernel cache
+    rows = [_kernels(options, variant)]  # first: what follows fills the kernel cache
     if options.repeats:
-        _speed(options, variant)
-    _noise(options, variant)
+        rows.append(_speed(options, variant))
+    rows.append(_noise(options, variant))
+    save("generate", rows, options, variant, GENERATION)
 
 
-def _speed(options: argparse.Namespace, variant: str) -> None:
+def _of_scene(options: argparse.Namespace) -> str:
+    return f"{options.scene}, {options.size}×{options.size}, {options.spp} samples a pixel"
+
+
+def _speed(options: argparse.Namespace, variant: str) -> Row:
     path = find_scene(options.scene)
     size, views, spp = (str(n) for n in (options.size, options.views, options.spp))
     seconds: dict[str, list[float]] = {"generate": [], "bare loop": []}
@@ -95,6 +102,14 @@ def _speed(options: argparse.Namespace, variant: str) -> None:
         print(f"{name}: {np.median(values) / options.views:.3f} s a view ({each} s in all)")
     ratio = np.median(seconds["generate"]) / np.median(seconds["bare loop"])
     print(f"ratio of the medians: {ratio:.3f}")
+    figures = {
+        f"{name}, a view": median_of([v / options.views for v in values], "s")
+        for name, values in seconds.items()
+    }
+    what = f"mi-nerf generate, the whole command, against a bare loop of mi.render: {options.views}"
+    return Row(
+        {"what": f"{what} views of {_of_scene(options)}"}, {**figures, "times": Figure(ratio)}
+    )
 
 
 def _timed(command: list[str]) -> float:
@@ -107,7 +122,7 @@ def _options(options: argparse.Namespace, views: int, spp: int) -> Options:
     return Options(train=views, val=0, test=0, size=(options.size, options.size), spp=spp)
 
 
-def _kernels(options: argparse.Namespace, variant: str) -> None:
+def _kernels(options: argparse.Namespace, variant: str) -> Row:
     """Counts cache misses view by view."""
     misses: list[int] = []
     trace = Tracer.trace
@@ -126,9 +141,11 @@ def _kernels(options: argparse.Namespace, variant: str) -> None:
         finally:
             Tracer.trace = trace  # type: ignore[method-assign]
     print(f"kernels compiled in views 1 to 4: {misses}")
+    what = f"kernels compiled after the first view of {_of_scene(options)}"
+    return Row({"what": what}, {"kernels": Figure(sum(misses[1:]))})
 
 
-def _noise(options: argparse.Namespace, variant: str) -> None:
+def _noise(options: argparse.Namespace, variant: str) -> Row:
     """The estimated mean squared error against the difference to 16 times the samples."""
     mi.set_variant(variant)
     ratios = []
@@ -152,6 +169,10 @@ def _noise(options: argparse.Namespace, variant: str) -> None:
             ratios.append(told / true)
             print(f"{view.name}: ceiling {noise['psnr_ceiling']:.2f} dB; told / true: {ratios[-1]}")
     print(f"mean ratio: linear, sRGB, 8 bits: {np.mean(ratios, axis=0)}")
+    names = ("linear", "sRGB", "8 bits")
+    figures = {name: mean_of(v, "") for name, v in zip(names, np.transpose(ratios), strict=True)}
+    what = "estimated noise of the ground truth over the difference to 16 times as many samples"
+    return Row({"what": f"{what}: {_of_scene(options)}"}, figures)
 
 
 if __name__ == "__main__":

@@ -28,6 +28,7 @@ from mi_nerf.cameras.pinhole import Intrinsics, sensor_dict
 from mi_nerf.cameras.poses import look_at
 from mi_nerf.cli import main as command
 from tests.benchmarks import data_folder, machine
+from tests.benchmarks.results import RENDERING, Figure, Row, add_options, mean_of, save
 from tests.support.fields import weight_keys
 
 _WARM_UP = 2  # iterations that may wait for the compiler
@@ -43,9 +44,11 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=4)
     parser.add_argument("--lr", type=float, default=1e-3)
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
-    mi.set_variant(choose_variant(options.variant))
-    print(f"{machine()}, {mi.variant()}")
+    variant = choose_variant(options.variant)
+    mi.set_variant(variant)
+    print(f"{machine()}, {variant}")
     with tempfile.TemporaryDirectory() as folder:
         path = options.field or _trained(Path(folder), options.seconds)
         loops = {held: Loop(path, options, held) for held in (True, False)}
@@ -70,6 +73,15 @@ def main() -> None:
             "compiled in the second half"
         )
     print(f"ratio {means[False] / means[True]:.3f}")
+    row = Row(
+        {"what": f"an iteration of inverse rendering, {options.size}×{options.size}"},
+        {
+            "grid held": mean_of(seconds[True][_WARM_UP:], "s"),
+            "grid that follows": mean_of(seconds[False][_WARM_UP:], "s"),
+            "ratio": Figure(means[False] / means[True]),
+        },
+    )
+    save("inverse_loop", [row], options, variant, RENDERING)
 
 
 def _trained(folder: Path, seconds: float) -> Path:

@@ -33,6 +33,15 @@ from mi_nerf.training.presets import preset
 from mi_nerf.training.trainer import Trainer
 from tests.benchmarks import machine, resident_megabytes
 from tests.benchmarks.published_step import synthetic_views
+from tests.benchmarks.results import (
+    RENDERING,
+    TRAINING,
+    Figure,
+    Row,
+    add_options,
+    median_of,
+    save,
+)
 
 
 def main() -> None:
@@ -43,23 +52,29 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=16)
     parser.add_argument("--spp", type=int, nargs="*", default=[4, 16, 64, 256])
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
     variant = choose_variant(options.variant)
     print(machine())
+    rows = []
     if options.steps:
-        _training(variant, options.steps)
+        rows.append(_training(variant, options.steps))
     if options.size:
-        _frame(variant, options.size, options.samples)
+        rows.append(_frame(variant, options.size, options.samples))
     if len(options.spp) == 1:
-        _gradient(variant, options.spp[0])
+        rows.append(_gradient(variant, options.spp[0]))
+    if rows:
+        save("memory", rows, options, variant, tuple(sorted({*TRAINING, *RENDERING})))
     for spp in options.spp if len(options.spp) > 1 else ():
         command = [sys.executable, "-m", "tests.benchmarks.memory", "--steps", "0", "--size", "0"]
-        subprocess.run([*command, "--variant", variant, "--spp", str(spp)], check=True)
+        command += ["--variant", variant, "--spp", str(spp), "--results", str(options.results)]
+        command += ["--no-write"] if options.no_write else []
+        subprocess.run(command, check=True)
 
 
-def _training(variant: str, steps: int) -> None:
+def _training(variant: str, steps: int) -> Row:
     trainer = Trainer(preset("nerf"), synthetic_views(), array_module(variant))
-    misses = 0
+    misses, resident = 0, []
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     for step in range(1, steps + 1):
         trainer.step(1e-3)
@@ -68,12 +83,20 @@ def _training(variant: str, steps: int) -> None:
             misses += sum(k.get("cache_hit") == 0 for k in history)
         if step % max(1, steps // 10) == 0:
             dr.sync_thread()
-            print(f"step {step}: {resident_megabytes():.0f} MB", flush=True)
+            resident.append(resident_megabytes())
+            print(f"step {step}: {resident[-1]:.0f} MB", flush=True)
     dr.set_flag(dr.JitFlag.KernelHistory, False)
     print(f"kernels compiled in the last {steps - steps // 2} steps: {misses}")
+    return Row(
+        {"what": f"resident memory, looked at ten times in {steps} steps of nerf"},
+        {
+            "memory": median_of(resident, "MB"),
+            "kernels compiled in the second half": Figure(misses),
+        },
+    )
 
 
-def _frame(variant: str, size: int, samples: int) -> None:
+def _frame(variant: str, size: int, samples: int) -> Row:
     mi.set_variant(variant)
     config = mi_nerf.NeuralFieldConfig()
     contents = mi_nerf.FieldFile(
@@ -103,9 +126,11 @@ def _frame(variant: str, size: int, samples: int) -> None:
         f"peak {peak:.0f} MB resident ({before:.0f} MB before), "
         f"mean alpha {image[..., 3].mean():.2f}"
     )
+    what = f"{size}×{size} pixels, {samples} samples a ray, of the 8×256 network by mi.render"
+    return Row({"what": what}, {"peak memory": Figure(peak, "MB")})
 
 
-def _gradient(variant: str, spp: int) -> None:
+def _gradient(variant: str, spp: int) -> Row:
     mi.set_variant(variant)
     camera = Intrinsics.from_angle_x(256, 256, 0.6911)
     wall = mi.ScalarTransform4f().translate([0, 1.5, 0]).rotate([1, 0, 0], 90).scale(3)
@@ -132,6 +157,8 @@ def _gradient(variant: str, spp: int) -> None:
         f"render_backward of 256x256 with {spp} samples a pixel: peak {peak:.0f} MB resident, "
         f"{time.perf_counter() - start:.1f} s, gradient {gradient:.1f}"
     )
+    what = f"render_backward of 256×256, {spp} samples a pixel, a field before a wall under prb"
+    return Row({"what": what}, {"peak memory": Figure(peak, "MB")})
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from mi_nerf.training.config import with_settings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.trainer import Trainer
 from tests.benchmarks import machine, resident_megabytes
+from tests.benchmarks.results import TRAINING, Figure, Row, add_options, median_of, save
 
 
 def synthetic_views() -> Dataset:
@@ -44,8 +45,10 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=5)
     parser.add_argument("--rays", type=int, default=1024)
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
-    backend = array_module(choose_variant(options.variant))
+    variant = choose_variant(options.variant)
+    backend = array_module(variant)
     settings = [f"sampling.rays={options.rays}", "box=-1,-1,-1,1,1,1"]
     trainer = Trainer(with_settings(replace(preset("paper")), settings), synthetic_views(), backend)
     seconds = []
@@ -64,10 +67,20 @@ def main() -> None:
         f"step: median {np.median(seconds):.2f} s, {min(seconds):.2f} to {max(seconds):.2f} s, "
         f"{rate:.0f} GFLOP/s, {resident_megabytes() / 1e3:.1f} GB resident"
     )
+    ours, numpy = drjit_product_rate(backend), numpy_product_rate()
     print(
-        f"plain matrix product 256x256x16384: {drjit_product_rate(backend):.0f} GFLOP/s in Dr.Jit, "
-        f"{numpy_product_rate():.0f} in NumPy on the CPU"
+        f"plain matrix product 256x256x16384: {ours:.0f} GFLOP/s in Dr.Jit, "
+        f"{numpy:.0f} in NumPy on the CPU"
     )
+    what = f"a training step of the published model, {result.rays} rays × (64 + 192) queries"
+    figures = {
+        "seconds": median_of(seconds, "s"),
+        "rate": Figure(rate, "GFLOP/s"),
+        "product in Dr.Jit": Figure(ours, "GFLOP/s"),
+        "product in NumPy": Figure(numpy, "GFLOP/s"),
+        "memory": Figure(resident_megabytes() / 1e3, "GB"),
+    }
+    save("published_step", [Row({"what": what}, figures)], options, variant, TRAINING)
 
 
 if __name__ == "__main__":

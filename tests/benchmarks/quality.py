@@ -3,7 +3,8 @@
     MI_NERF_DATA=… python -m tests.benchmarks.quality --seconds 120 --seeds 3
 
 Trains lego_200 at half its size (100x100) through the command line, evaluates all views
-of the validation split by the nerf2020 protocol, and prints a line a seed and the mean.
+of the validation split by the nerf2020 protocol, prints a line a seed and the mean, and writes
+it to docs/results/quality.json.
 """
 
 from __future__ import annotations
@@ -14,10 +15,22 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from mi_nerf.base.variants import choose_variant
 from tests.benchmarks import data_folder, machine
+from tests.benchmarks.results import TRAINING, Protocol, Row, add_options, mean_of, save
+
+_UNITS = {
+    "psnr": "dB",
+    "ssim": "",
+    "steps": "",
+    "queries_per_ray": "",
+    "seconds_per_view": "s",
+    "restarts": "",
+}
 
 
 def main() -> None:
@@ -32,6 +45,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, help="evaluate so many views, evenly spread")
     parser.add_argument("--preset", default="nerf")
     parser.add_argument("--set", nargs="*", default=[])
+    add_options(parser)
     options = parser.parse_args()
     data = data_folder(options.data)
     print(machine())
@@ -45,13 +59,29 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             results.append(_train_and_evaluate(data, Path(folder), seed, options))
         print(f"seed {seed}: {_line(results[-1])}", flush=True)
-    mean = {key: float(np.mean([r[key] for r in results])) for key in results[0]}
+    mean = {key: float(np.mean([r[key] for r in results])) for key in _UNITS}
     print(f"mean of {options.seeds}: {_line(mean)}")
+    save("quality", [_row(results, options)], options, choose_variant(), TRAINING)
+
+
+def _row(results: list[dict[str, Any]], options: argparse.Namespace) -> Row:
+    width, height = results[0]["size"]
+    return Row(
+        {
+            "data": options.data,
+            "preset": " ".join([options.preset, *options.set]),
+            "size": f"{width}×{height}",
+            "time": f"{options.seconds:g} s",
+        },
+        {key: mean_of([r[key] for r in results], unit) for key, unit in _UNITS.items()},
+        Protocol(options.data, options.split, results[0]["views"], (width, height)),
+        tuple(range(options.first_seed, options.first_seed + options.seeds)),
+    )
 
 
 def _train_and_evaluate(
     data: Path, folder: Path, seed: int, options: argparse.Namespace
-) -> dict[str, float]:
+) -> dict[str, Any]:
     run, record = folder / "run", folder / "eval.json"
     command = [sys.executable, "-m", "mi_nerf.cli"]
     train = ["train", str(data), "--out", str(run), "--seed", str(seed)]
@@ -67,11 +97,13 @@ def _train_and_evaluate(
     result = json.loads(record.read_text())
     log = [json.loads(line) for line in (run / "log.jsonl").read_text().splitlines()]
     return {
+        "size": result["size"],
+        "views": result["views"],
         "psnr": result["mean"]["psnr"],
         "ssim": result["mean"]["ssim"],
         "steps": log[-1]["step"],
         "queries_per_ray": result["queries_per_ray"],
-        "ms_per_view": 1e3 * result["seconds_per_view"],
+        "seconds_per_view": result["seconds_per_view"],
         "restarts": sum(line.get("event") == "restart" for line in log),
     }
 
@@ -79,7 +111,8 @@ def _train_and_evaluate(
 def _line(result: dict[str, float]) -> str:
     return (
         f"{result['psnr']:.2f} dB, SSIM {result['ssim']:.4f}, {result['steps']:.0f} steps, "
-        f"{result['queries_per_ray']:.1f} queries a ray, {result['ms_per_view']:.0f} ms a view, "
+        f"{result['queries_per_ray']:.1f} queries a ray, "
+        f"{result['seconds_per_view']:.3f} s a view, "
         f"{result['restarts']:g} restarts"
     )
 

@@ -33,6 +33,17 @@ from mi_nerf.training import run as training
 from mi_nerf.training.presets import preset
 from mi_nerf.training.run_folder import FIELD
 from tests.benchmarks import data_folder, machine
+from tests.benchmarks.results import (
+    RENDERING,
+    TRAINING,
+    Figure,
+    Protocol,
+    Row,
+    add_options,
+    mean_of,
+    median_of,
+    save,
+)
 
 
 def main() -> None:
@@ -44,6 +55,7 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=25)
     parser.add_argument("--repeats", type=int, default=15)
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
     variant = choose_variant(options.variant)
     mi.set_variant(variant)
@@ -54,11 +66,12 @@ def main() -> None:
         data = data_folder(options.data)
         run = training.start(data, Path(folder) / "run", config, variant)
         run.train(show_bar=False)
-        _quality(run, data, options.views)
-        _speed(Path(folder) / "run" / FIELD, data, options.repeats)
+        rows = _quality(run, data, options.views)
+        rows.append(_speed(Path(folder) / "run" / FIELD, data, options))
+    save("rendering", rows, options, variant, tuple(sorted({*TRAINING, *RENDERING})))
 
 
-def _quality(run: training.Run, data: Path, views: int) -> None:
+def _quality(run: training.Run, data: Path, views: int) -> list[Row]:
     trainer, backend = run.trainer, array_module(run.variant)
     march, field = run.field_file().march, trainer.field
     hull = OccupancyGrid(field.lower, field.upper, trainer._hull, backend.Float)
@@ -68,6 +81,7 @@ def _quality(run: training.Run, data: Path, views: int) -> None:
         "and early termination": (trainer.occupancy, march),
     }
     dataset = load_dataset(data, "val", downscale=2, limit=views)
+    rows = []
     for name, (grid, settings) in ways.items():
         found, queries = [], 0
         for k, pose in enumerate(dataset.cam_to_world):
@@ -79,9 +93,19 @@ def _quality(run: training.Run, data: Path, views: int) -> None:
             queries += view.queries
         rays = len(dataset) * dataset.intrinsics.width * dataset.intrinsics.height
         print(f"{name}: {np.mean(found):.3f} dB, {queries / rays:.1f} queries a ray")
+        size = (dataset.intrinsics.width, dataset.intrinsics.height)
+        rows.append(
+            Row(
+                {"what": name, "preset": run.config.preset},
+                {"psnr": mean_of(found, "dB"), "queries_per_ray": Figure(queries / rays)},
+                Protocol(data.name, "val", len(dataset), size),
+                (run.config.seed,),
+            )
+        )
+    return rows
 
 
-def _speed(field: Path, data: Path, repeats: int) -> None:
+def _speed(field: Path, data: Path, options: argparse.Namespace) -> Row:
     dataset = load_dataset(data, "val", limit=5)
     pose = dataset.cam_to_world[0]
     scene = mi.load_dict(
@@ -93,7 +117,7 @@ def _speed(field: Path, data: Path, repeats: int) -> None:
         }
     )
     seconds = []
-    for seed in range(repeats + 1):
+    for seed in range(options.repeats + 1):
         start = time.perf_counter()
         dr.eval(mi.render(scene, spp=1, seed=seed))
         dr.sync_thread()
@@ -102,8 +126,13 @@ def _speed(field: Path, data: Path, repeats: int) -> None:
     first, *rest = seconds
     print(
         f"mi.render, {size.width}x{size.height}, 1 sample a pixel: median "
-        f"{np.median(rest):.3f} s of {repeats} ({min(rest):.3f} to {max(rest):.3f}), "
+        f"{np.median(rest):.3f} s of {len(rest)} ({min(rest):.3f} to {max(rest):.3f}), "
         f"the first {first:.2f} s"
+    )
+    what = f"a frame by mi.render, {size.width}×{size.height}"
+    return Row(
+        {"what": what, "preset": options.preset},
+        {"seconds": median_of(rest, "s"), "first": Figure(first, "s")},
     )
 
 

@@ -3,10 +3,10 @@
     python -m tests.benchmarks.robustness --out robustness
 
 Path-traces small datasets of scenes that come with mi_nerf (or takes folders with --data),
-trains each of them with every preset and seed for a few seconds, and prints a Markdown
-table. A run has failed if it stops with an error, or if its held-out views are not
-``--margin`` decibels better than images of one even colour. Everything is kept in ``--out``:
-calling the command again goes on where it stopped, and adds presets and seeds.
+trains each of them with every preset and seed for a few seconds, and writes
+docs/results/robustness.json. A run has failed if it stops with an error, or if its held-out
+views are not ``--margin`` decibels better than images of one even colour. Everything is kept in
+``--out``: calling the command again goes on where it stopped, and adds presets and seeds.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import argparse
 import json
 import shutil
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -34,12 +35,13 @@ from mi_nerf.training.config import with_settings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.run_folder import LOG
 from tests.benchmarks import machine
+from tests.benchmarks.results import TRAINING, Figure, Protocol, Row, add_options, mean_of, save
 
 RESULTS = "results.json"
 
 
 def main() -> None:
-    """Trains what is missing, then prints the table."""
+    """Trains what is missing, then sums up."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--scenes", nargs="*", default=["arches", "kettle", "bonsai"])
@@ -52,6 +54,7 @@ def main() -> None:
     parser.add_argument("--margin", type=float, default=3.0, help="dB above one even colour")
     parser.add_argument("--set", nargs="*", default=[])
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
     variant, end = choose_variant(options.variant), time.monotonic() + options.limit
     options.out.mkdir(parents=True, exist_ok=True)
@@ -69,7 +72,10 @@ def main() -> None:
                     write_json(file, results)
                     print(f"{key}: {results[key]}", flush=True)
     print(f"{machine()}, {variant}, {options.seconds:g} s a run {' '.join(options.set)}\n")
-    _print_table(results, data, options)
+    rows = list(_rows(results, data, options))
+    for row in rows:
+        print(f"{', '.join(row.labels.values())}: {row.figures}")
+    save("robustness", rows, options, variant, TRAINING)
 
 
 def _generated(folder: Path, scene: str, size: int, variant: str) -> Path:
@@ -113,16 +119,11 @@ def _even_psnr(data: Path) -> float:
     return float(np.mean([psnr(np.broadcast_to(i.mean((0, 1)), i.shape), i) for i in images]))
 
 
-def _print_table(
+def _rows(
     results: dict[str, Any], data: dict[str, Path], options: argparse.Namespace
-) -> None:
-    print(
-        "| dataset | preset | runs | restarted | steps skipped | failed "
-        "| PSNR: mean (least – greatest) | one even colour | steps |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
+) -> Iterator[Row]:
     for name, folder in data.items():
-        even = _even_psnr(folder)
+        even, views = _even_psnr(folder), load_dataset(folder, "test")
         for preset_name in options.presets:
             runs = [
                 result
@@ -132,15 +133,24 @@ def _print_table(
                 and int(key.split()[2]) < options.seeds
             ]
             quality = [r["psnr"] for r in runs if r["psnr"] is not None]
+            if not runs:
+                continue
             good = [q for q in quality if q > even + options.margin]
-            spread = "–"
-            if quality:
-                spread = f"{np.mean(quality):.2f} dB ({min(quality):.2f} – {max(quality):.2f})"
-            print(
-                f"| {name} | {preset_name} | {len(runs)} "
-                f"| {sum(r['restarts'] > 0 for r in runs)} | {sum(r['skipped'] for r in runs)} "
-                f"| {len(runs) - len(good)} | {spread} | {even:.2f} dB "
-                f"| {np.median([r['steps'] for r in runs]) if runs else 0:.0f} |"
+            yield Row(
+                {"data": name, "preset": preset_name},
+                {
+                    "runs": Figure(len(runs)),
+                    "restarted": Figure(sum(r["restarts"] > 0 for r in runs)),
+                    "skipped": Figure(sum(r["skipped"] for r in runs)),
+                    "failed": Figure(len(runs) - len(good)),
+                    **({"psnr": mean_of(quality, "dB")} if quality else {}),
+                    "even": Figure(even, "dB"),
+                    "steps": Figure(float(np.median([r["steps"] for r in runs]))),
+                },
+                Protocol(
+                    name, "test", len(views), (views.intrinsics.width, views.intrinsics.height)
+                ),
+                tuple(range(options.seeds)),
             )
 
 

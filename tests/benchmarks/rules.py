@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -34,6 +35,15 @@ from mi_nerf.march.settings import MarchSettings
 from mi_nerf.tasks.target import open_target
 from mi_nerf.training.batches import RayBatch, RaySource, step_rng
 from tests.benchmarks import machine
+from tests.benchmarks.results import (
+    QUADRATURE,
+    TRAINING,
+    Figure,
+    Protocol,
+    Row,
+    add_options,
+    save,
+)
 from tests.fields.test_closed_form import JUMPS, VALUES
 from tests.march.test_rules import errors
 
@@ -54,20 +64,22 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=10)
     parser.add_argument("--rays", type=int, default=4096, help="drawn from the views")
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
     variant = choose_variant(options.variant)
     backend = array_module(variant)
     print(f"{machine()}, {variant}\n")
     if options.run is None:
-        closed_forms(backend, options.plot)
+        save("rules", closed_forms(backend, options.plot), options, variant, QUADRATURE, whole=True)
     else:
-        trained(backend, options)
+        rows = trained(backend, options)
+        save("rules_trained", rows, options, variant, TRAINING)
 
 
 # ---- Closed forms -------------------------------------------------------------
 
 
-def closed_forms(backend: Any, plot: Path | None) -> None:
+def closed_forms(backend: Any, plot: Path | None) -> list[Row]:
     """Errors at 64 and 192 samples, and the order of convergence from 64 to 768."""
     columns: dict[str, Callable[[str, int], float]] = {
         "opacity": lambda name, n: _errors(backend, name, "constant", n)[0],
@@ -82,19 +94,20 @@ def closed_forms(backend: Any, plot: Path | None) -> None:
             for rule in RULES
         },
     }
-    samples = (64, 192, 768)
-    print("Errors at 64 and at 192 samples, and the order of convergence (from 64 to 768):\n")
-    print(f"| field | {' | '.join(columns)} |\n|{'---|' * (len(columns) + 1)}")
+    rows = []
     for name in FIELDS:
-        cells = []
-        for error in columns.values():
-            coarse, middle, fine = (error(name, n) for n in samples)
-            exact = coarse < 1e-12
-            order = "exact" if exact else f"{math.log(coarse / fine) / math.log(12):.1f}"
-            cells.append("exact" if exact else f"{coarse:.1e}, {middle:.1e}; {order}")
-        print(f"| {name} | {' | '.join(cells)} |", flush=True)
+        figures = {}
+        for column, error in columns.items():
+            coarse, middle, fine = (error(name, n) for n in (64, 192, 768))
+            key = re.sub(r"\W+", "_", column)
+            figures |= {f"{key}_64": Figure(coarse), f"{key}_192": Figure(middle)}
+            if coarse > 1e-12:  # otherwise exact up to rounding
+                figures[f"{key}_order"] = Figure(math.log(coarse / fine) / math.log(12))
+        print(f"{name}: {' '.join(f'{k} {f.value:.2g}' for k, f in figures.items())}", flush=True)
+        rows.append(Row({"field": name}, figures))
     if plot is not None:
         _draw(plot, {c: f for c, f in columns.items() if c.startswith("depth")})
+    return rows
 
 
 def _errors(
@@ -139,7 +152,7 @@ def _draw(path: Path, columns: dict[str, Callable[[str, int], float]]) -> None:
 # ---- Trained fields -------------------------------------------------------------
 
 
-def trained(backend: Any, options: argparse.Namespace) -> None:
+def trained(backend: Any, options: argparse.Namespace) -> list[Row]:
     """Mean absolute difference to the dense image, and PSNR lost against the truth."""
     target = open_target(options.run)
     if target.data is None:
@@ -161,14 +174,25 @@ def trained(backend: Any, options: argparse.Namespace) -> None:
     print(f"{options.run}: {options.rays} rays of {len(views)} views ({options.split}), on white.")
     print(f"With {DENSE} samples {_psnr(dense, truth):.3f} dB; with fewer, mean absolute")
     print("difference to that (in 1/255) and change of the PSNR:\n")
-    print("| samples | " + " | ".join(_columns()) + f" |\n|{'---|' * (len(_columns()) + 1)}")
+    size = (views.intrinsics.width, views.intrinsics.height)
+    protocol = Protocol(
+        Path(target.data).name, options.split, len(views), size, metric="pixels together, floats"
+    )
+    rows = []
     for samples in (32, 64, 128, 256):
-        cells = []
-        for rule, jitter in _columns().values():
+        figures = {}
+        for column, (rule, jitter) in _columns().items():
             found = image(rule, samples, jitter)
-            off = 255 * np.abs(found - dense).mean()
-            cells.append(f"{off:.3f}, {_psnr(found, truth) - _psnr(dense, truth):+.3f} dB")
-        print(f"| {samples} | {' | '.join(cells)} |", flush=True)
+            lost = Figure(_psnr(found, truth) - _psnr(dense, truth), "dB")
+            off = Figure(255 * float(np.abs(found - dense).mean()))
+            key = re.sub(r"\W+", "_", column)
+            figures |= {f"{key}_off": off, f"{key}_psnr": lost}
+        print(
+            f"{samples}: {' '.join(f'{k} {f.value:.3f}' for k, f in figures.items())}", flush=True
+        )
+        labels = {"field": Path(options.run).name, "samples": str(samples)}
+        rows.append(Row(labels, figures, protocol))
+    return rows
 
 
 def _columns() -> dict[str, tuple[Rule, bool]]:

@@ -18,6 +18,7 @@ from mi_nerf.base.variants import array_module, choose_variant
 from mi_nerf.estimators.majorant import Majorants
 from mi_nerf.fields.closed_form import closed_form
 from tests.benchmarks import machine
+from tests.benchmarks.results import Figure, Row, add_options, save
 from tests.estimators.test_tracking import estimates, z_scores
 from tests.fields.test_closed_form import JUMPS, VALUES, directed, within
 from tests.support import closed_forms as oracle
@@ -34,18 +35,28 @@ def main() -> None:
     )
     parser.add_argument("--paths", type=float, default=20, help="millions for each field")
     parser.add_argument("--variant")
+    add_options(parser)
     options = parser.parse_args()
     variant = choose_variant(options.variant)
     print(f"{machine()}, {variant}\n")
     print("| field | million paths | rms z of opacity | z of the mean opacity | seconds |")
     print("|---|---|---|---|---|")
     repeats = max(1, round(options.paths * 1e6 / (RAYS * PATHS)))
+    rows = []
     for name in FIELDS:
         start = time.perf_counter()
         z, together = scores(array_module(variant), name, repeats)
         paths = repeats * RAYS * PATHS / 1e6
         seconds = time.perf_counter() - start
         print(f"| {name} | {paths:.1f} | {z:.2f} | {together:+.2f} | {seconds:.0f} |")
+        figures = {
+            "rms_z": Figure(z),
+            "z_of_mean": Figure(together),
+            "million_paths": Figure(paths),
+            "seconds": Figure(seconds, "s"),
+        }
+        rows.append(Row({"field": name}, figures))
+    save("unbiased", rows, options, variant, ("estimators", "fields"), whole=True)
 
 
 def scores(ad: object, name: str, repeats: int) -> tuple[float, float]:

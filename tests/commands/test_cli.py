@@ -428,8 +428,8 @@ RUN_DAMAGES: dict[str, tuple[Callable[[Path], object], str]] = {
         "config.json: not a training configuration of this version: unknown setting 'qqq'",
     ),
     "newer settings": (
-        lambda r: change_json(r / "config.json", lambda c: c["format"].update(version=2)),
-        "config.json: newer than this program: config.json of format version 2, this mi_nerf",
+        lambda r: change_json(r / "config.json", lambda c: c["format"].update(version=3)),
+        "config.json: newer than this program: config.json of format version 3, this mi_nerf",
     ),
     "other seed": (
         lambda r: change_json(r / "config.json", lambda c: c["settings"].update(seed=1)),

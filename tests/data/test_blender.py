@@ -20,6 +20,7 @@ from mi_nerf.cameras.pinhole import Intrinsics
 from mi_nerf.cameras.poses import mitsuba_from_opengl
 from mi_nerf.data import Dataset, available_splits, evenly_spread_indices, load_dataset
 from mi_nerf.images.read import average_blocks, read_image
+from mi_nerf.images.stored import premultiplied
 from tests.support.datasets import orbit_poses, random_images, write_blender_dataset, write_exr
 
 ANGLE = 0.8
@@ -73,8 +74,8 @@ def test_values(tmp_path: Path) -> None:
     dataset = load_dataset(tmp_path, "val")
     assert (dataset.path, dataset.split, len(dataset)) == (tmp_path, "val", 4)
     assert dataset.names == ("r_0", "r_1", "r_2", "r_3")
-    assert dataset.images.dtype == np.float32
-    assert dataset.images == pytest.approx(slow_premultiplied(images), abs=1e-7)
+    assert dataset.images.dtype == np.uint8 and np.array_equal(dataset.images, images)
+    assert dataset.premultiplied() == pytest.approx(slow_premultiplied(images), abs=1e-7)
     assert (dataset.color_space, dataset.has_alpha) == ("srgb", True)
     assert np.array_equal(dataset.cam_to_world, poses)
     assert dataset.intrinsics == Intrinsics.from_angle_x(6, 5, ANGLE)
@@ -94,16 +95,16 @@ def test_rgb_images_are_opaque(tmp_path: Path) -> None:
     write_blender_dataset(tmp_path, images, orbit_poses(2), ANGLE)
     dataset = load_dataset(tmp_path, "train")
     assert not dataset.has_alpha
-    assert (dataset.images[..., 3] == 1).all()
-    assert dataset.images[..., :3] == pytest.approx(images / 255, abs=1e-7)
+    assert (dataset.premultiplied()[..., 3] == 1).all()
+    assert dataset.premultiplied()[..., :3] == pytest.approx(images / 255, abs=1e-7)
 
 
 def test_images_of_the_split_may_differ_in_alpha(scene: Path) -> None:
     Image.fromarray(random_images(1, 5, 6, channels=3)[0]).save(scene / "train" / "r_0.png")
     dataset = load_dataset(scene, "train")
     assert dataset.has_alpha
-    assert (dataset.images[0, ..., 3] == 1).all()
-    assert (dataset.images[1, ..., 3] < 1).any()
+    assert (dataset.image(0)[..., 3] == 1).all()
+    assert (dataset.image(1)[..., 3] < 1).any()
 
 
 @pytest.mark.parametrize("channels", [3, 4])
@@ -119,7 +120,8 @@ def test_16_bit_png(tmp_path: Path, channels: int) -> None:
     if channels == 3:
         values = np.concatenate([values, np.full((9, 13, 1), 65535, np.uint16)], axis=-1)
     assert image.has_alpha == (channels == 4)
-    assert image.pixels == pytest.approx(slow_premultiplied(values), abs=2e-7)
+    assert image.pixels.dtype == np.uint16
+    assert premultiplied(image.pixels) == pytest.approx(slow_premultiplied(values), abs=2e-7)
 
 
 def test_palettes(tmp_path: Path) -> None:
@@ -129,9 +131,9 @@ def test_palettes(tmp_path: Path) -> None:
     picture.save(tmp_path / "key.png", transparency=int(np.asarray(picture)[1, 2]))
     opaque, key = read_image(tmp_path / "opaque.png"), read_image(tmp_path / "key.png")
     assert not opaque.has_alpha and key.has_alpha
-    assert opaque.pixels[..., :3] == pytest.approx(np.asarray(picture.convert("RGB")) / 255)
-    assert (key.pixels[1, 2] == 0).all()
-    assert key.pixels[..., 3].max() == 1
+    assert np.array_equal(opaque.pixels[..., :3], np.asarray(picture.convert("RGB")))
+    assert (premultiplied(key.pixels)[1, 2] == 0).all()
+    assert key.pixels[..., 3].max() == 255
 
 
 def test_exr_is_linear_and_already_premultiplied(scene: Path) -> None:
@@ -157,7 +159,8 @@ def test_exr_half_precision_without_alpha(tmp_path: Path) -> None:
     write_exr(tmp_path / "image.exr", R=plane, G=2 * plane, B=3 * plane)
     image = read_image(tmp_path / "image.exr")
     assert not image.has_alpha
-    assert np.array_equal(image.pixels[..., 1], (2 * plane).astype(np.float32))
+    assert image.pixels.dtype == np.float16
+    assert np.array_equal(image.pixels[..., 1], 2 * plane)
     assert (image.pixels[..., 3] == 1).all()
 
 
@@ -249,7 +252,7 @@ def test_downscale_averages_premultiplied_and_crops(tmp_path: Path) -> None:
     write_blender_dataset(tmp_path, images, orbit_poses(2), ANGLE)
     dataset = load_dataset(tmp_path, "train", downscale=2)
     expected = [slow_block_means(image, 2) for image in slow_premultiplied(images)]
-    assert dataset.images == pytest.approx(np.stack(expected), abs=1e-6)
+    assert dataset.premultiplied() == pytest.approx(np.stack(expected), abs=1e-6)
     assert dataset.intrinsics == Intrinsics.from_angle_x(9, 7, ANGLE).downscale(2)
     assert (dataset.intrinsics.width, dataset.intrinsics.height) == (4, 3)
 
@@ -534,3 +537,16 @@ def test_downscale_beyond_the_image(scene: Path) -> None:
 @pytest.mark.parametrize("downscale", [0, -1])
 def test_downscale_below_one(scene: Path, downscale: int) -> None:
     expect_error(scene, "downscale", str(downscale), downscale=downscale)
+
+
+def test_files_of_different_depths_become_floats(scene: Path) -> None:
+    mi = pytest.importorskip("mitsuba")
+    values = np.random.default_rng(1).integers(0, 65536, (5, 6, 4)).astype(np.uint16)
+    bitmap = mi.Bitmap(values)
+    bitmap.set_srgb_gamma(True)
+    bitmap.write(str(scene / "train" / "r_1.png"))
+    before = load_dataset(scene, "train").subset([0, 2])
+    dataset = load_dataset(scene, "train")
+    assert dataset.images.dtype == np.float32
+    assert dataset.image(1) == pytest.approx(slow_premultiplied(values), abs=2e-7)
+    assert np.array_equal(dataset.image(0), before.image(0))

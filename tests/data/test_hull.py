@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,57 @@ def test_cells_at_the_edge_of_a_wide_picture_reach_far() -> None:
             assert carve(dataset, *box, 1).all()
             dataset.images[0, y, x] = 0
     assert judged > 60
+
+
+def cell_by_cell(
+    dataset: Dataset, lower: np.ndarray, upper: np.ndarray, shape: tuple[int, ...]
+) -> np.ndarray:
+    """The same cells, each judged against each view by itself: no blocks, no order, no sums."""
+    size = (upper - lower) / np.asarray(shape)
+    centers = (lower + (np.argwhere(np.ones(shape, bool)) + 0.5) * size).reshape(-1, 3)
+    radius, camera = float(np.linalg.norm(size)) / 2, dataset.intrinsics
+    kept = np.ones(len(centers), bool)
+    for image, pose in zip(dataset.images, dataset.cam_to_world, strict=True):
+        pixels, depths = project(centers, camera, pose)
+        for cell, ((x, y), depth) in enumerate(zip(pixels, depths, strict=True)):
+            if depth - radius <= 1e-6 * radius:
+                continue
+            reach_x = radius / (depth - radius) * np.hypot(camera.fx, x - camera.cx) + 1
+            reach_y = radius / (depth - radius) * np.hypot(camera.fy, y - camera.cy) + 1
+            x0, x1 = math.floor(x - reach_x), math.ceil(x + reach_x)
+            y0, y1 = math.floor(y - reach_y), math.ceil(y + reach_y)
+            if x0 >= 0 and y0 >= 0 and x1 <= camera.width and y1 <= camera.height:
+                kept[cell] &= bool((image[y0:y1, x0:x1, 3] > 0).any())
+    return kept.reshape(shape)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize(("angle", "distance"), [(0.7, 4.0), (1.9, 1.6)])
+def test_blocks_leave_the_cells_that_are_left_one_by_one(
+    seed: int, angle: float, distance: float
+) -> None:
+    """Boxes of any proportions, whole blocks or not; cameras that see all of it, or stand in it."""
+    rng = np.random.default_rng(seed)
+    camera = dataclasses.replace(Intrinsics.from_angle_x(90, 70, angle), cx=47.0, cy=33.0)
+    poses = cameras(rng, 6, distance, np.array([0.05, -0.1, 0.2]))
+    dataset = silhouettes(random_spheres(rng), poses, camera)
+    lower = np.array(LOWER) * rng.uniform(0.3, 1.0, 3)
+    upper = np.array(UPPER) * rng.uniform(0.3, 1.0, 3)
+    box = tuple(lower.tolist()), tuple(upper.tolist())
+    mask = carve(dataset, *box, int(rng.choice([8, 13, 16, 21])))
+    assert 0.01 < mask.mean() < 0.999
+    np.testing.assert_array_equal(mask, cell_by_cell(dataset, lower, upper, mask.shape))
+
+
+@pytest.mark.parametrize("side", [1, 2, 7, 8, 9])
+def test_the_smallest_grids(side: int) -> None:
+    rng = np.random.default_rng(side)
+    camera = Intrinsics.from_angle_x(60, 60, 0.9)
+    dataset = silhouettes(random_spheres(rng, 2), cameras(rng, 9, 4.0, np.zeros(3)), camera)
+    mask = carve(dataset, LOWER, UPPER, side)
+    np.testing.assert_array_equal(
+        mask, cell_by_cell(dataset, np.array(LOWER), np.array(UPPER), mask.shape)
+    )
 
 
 def test_most_empty_space_is_carved() -> None:

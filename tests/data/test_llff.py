@@ -50,7 +50,7 @@ def test_every_eighth_view_is_for_testing(capture: Path) -> None:
     assert set(train.names) | set(test.names) == {f"IMG_{i:04d}" for i in range(18)}
     assert len(train) == 15 and train.split == "train" and not train.has_alpha
     expected = random_images(18, 16, 24, 3)[::8] / 255
-    assert np.allclose(test.images[..., :3], expected, atol=1e-6)
+    assert np.allclose(test.premultiplied()[..., :3], expected, atol=1e-6)
     limited = load_dataset(capture, "test", limit=2)
     assert limited.names == ("IMG_0000", "IMG_0008")
     assert np.array_equal(limited.cam_to_world, test.cam_to_world[:2])
@@ -148,7 +148,7 @@ def test_which_images_are_read(folders: list[str], read: str, tmp_path: Path) ->
         write_llff_dataset(tmp_path, images, poses, FOCAL, subfolder=name)
     (tmp_path / read / "notes.txt").write_text("not an image")
     expected = random_images(3, 8, 12, 3, seed=folders.index(read))
-    assert np.allclose(load_dataset(tmp_path, "test").images[0, ..., :3], expected[0] / 255)
+    assert np.allclose(load_dataset(tmp_path, "test").image(0)[..., :3], expected[0] / 255)
 
 
 # ---- What is refused ---------------------------------------------------------

@@ -212,3 +212,19 @@ def test_parameters_are_counted() -> None:
     without = replace(FIELD, grid=None)
     more = CONFIG.entries() * CONFIG.features + CONFIG.size * FIELD.network.width
     assert FIELD.parameter_count() == without.parameter_count() + more
+
+
+def test_weights_of_levels(ad: Any) -> None:
+    rng = np.random.default_rng(2)
+    table = rng.normal(size=(CONFIG.entries(), CONFIG.features)).astype(np.float32)
+    p = rng.uniform(-1, 1, (40, 3)).astype(np.float32)
+    weights = [1.0, 0.25, 0.5, 0.0]
+    grid = HashGrid(CONFIG, ad.Float)
+    found = grid.features(vectors(ad, p), ad.TensorXf(table), ad.Float(weights))
+    expected = slow_features(CONFIG, table, p) * np.repeat(weights, CONFIG.features)[:, None]
+    assert np.stack([np.array(f) for f in found]) == pytest.approx(expected, abs=2e-5)
+
+
+def test_entries_that_are_still_to_be_found() -> None:
+    with pytest.raises(ValueError, match="log2_entries is not found yet"):
+        HashGridConfig(log2_entries=None).entries()

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import inspect
 import math
-import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -29,8 +28,8 @@ from mi_nerf.training.losses import relative_error
 from mi_nerf.training.optimizer import Adam
 from mi_nerf.training.presets import preset
 from mi_nerf.training.trainer import Trainer
+from tests.benchmarks.results import RESULTS, Row, load
 from tests.hard_cases import Case, Finding, fields, media, networks, rays, training
-from tests.hard_cases.__main__ import number
 from tests.hard_cases.cases import CASES
 from tests.support.datasets import blob_images, orbit_poses, write_blob_dataset
 
@@ -275,7 +274,7 @@ def test_row_17_saturation(ad: Any) -> None:
 @pytest.mark.slow
 def test_row_17_white_objects_become_opaque(ad: Any, views: Dataset) -> None:
     """Training places images with alpha before random colours unless it is told otherwise."""
-    images = views.images.copy()
+    images = views.premultiplied().copy()
     images[..., :3] = images[..., 3:]  # premultiplied white
     white = replace(views, images=images)
     opacities = {}
@@ -342,7 +341,7 @@ def test_row_19_hdr_targets(ad: Any) -> None:
 @pytest.mark.slow
 def test_row_19_linear_images_get_the_relative_loss(ad: Any, views: Dataset) -> None:
     """From 1e-3 to 1e4 in one picture."""
-    images = views.images.copy()
+    images = views.premultiplied().copy()
     images[..., :3] *= np.logspace(-3, 4, 16, dtype=np.float32)[:, None]
     trainer = Trainer(small(), replace(views, images=images, color_space="linear"), ad)
     assert trainer._loss is relative_error
@@ -388,44 +387,48 @@ def test_row_20_a_step_far_on(ad: Any, views: Dataset) -> None:
 # ---- The table ----------------------------------------------------------------------------------
 
 
-PAGE = (Path(__file__).parents[2] / "docs" / "stability.md").read_text()
+def recorded(name: str) -> list[Row]:
+    """The rows of a file of figures, which the tables of docs/stability.md are made from."""
+    return [record.row for record in load(RESULTS / f"{name}.json")]
 
 
-def agrees(printed: str, value: float) -> bool:
-    """Whether a number of the page is the one measured; errors of rounding by their order."""
+def agrees(printed: float, value: float) -> bool:
+    """Whether a recorded number is the one measured; errors of rounding by their order."""
     if not math.isfinite(value):
-        return printed == number(value)
-    smaller, larger = sorted((abs(float(printed)), abs(value)))
+        return str(printed) == str(value)
+    smaller, larger = sorted((abs(printed), abs(value)))
     if larger < 1e-5:
         return larger <= 30 * max(smaller, 1e-8)
-    return float(printed) == pytest.approx(value, rel=0.05)
+    return printed == pytest.approx(value, rel=0.05)
 
 
 def test_rows_are_those_of_the_documentation() -> None:
     """With the test that the table names."""
     here = {name for name, value in globals().items() if inspect.isfunction(value)}
     assert [case.row for case in CASES] == list(range(1, 21))
-    for case in CASES:
+    heads = [row.labels for row in recorded("hard_cases") if row.labels["row"]]
+    for case, labels in zip(CASES, heads, strict=True):
         assert case.test in here
-        assert f"| {case.row} | {case.name} | {case.naive} |" in PAGE
+        expected = {"row": str(case.row), "case": case.name, "formula": case.naive}
+        assert expected.items() <= labels.items()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: str(case.row))
 def test_numbers_are_those_of_the_documentation(case: Case) -> None:
-    rows = re.findall(rf"^\|.*\| ([^|]+) \| (\S+) \| (\S+) \| `{case.test}` \|$", PAGE, re.M)
+    rows = [r for r in recorded("hard_cases") if r.labels["test"] == f"`{case.test}`"]
     found = measured(case.measure, array_module("llvm_ad_rgb"))
-    assert [what for what, *_ in rows] == [finding.what for finding in found]
-    for (what, *printed), finding in zip(rows, found, strict=True):
-        values = (finding.naive, finding.ours)
-        assert all(map(agrees, printed, values)), (what, printed, values)
+    assert [row.labels["measured"] for row in rows] == [finding.what for finding in found]
+    for row, finding in zip(rows, found, strict=True):
+        figures, values = row.figures, {"usual": finding.naive, "ours": finding.ours}
+        assert all(agrees(figures[name].value, v) for name, v in values.items()), (row, values)
 
 
 @pytest.mark.slow
 def test_sheets_are_those_of_the_documentation() -> None:
-    rows = re.findall(r"^\| (0\.\d+) \| (\S+) \| (\S+) \| (\S+) \|$", PAGE, re.M)
-    assert [float(thickness) for thickness, *_ in rows] == list(fields.THICKNESSES)
-    for thickness, *printed in rows:
-        errors = fields.sheet_errors(array_module("llvm_ad_rgb"), float(thickness))
-        for text, (opacity, _) in zip(printed, errors.values(), strict=True):
-            assert float(text) == pytest.approx(opacity, rel=0.1), thickness
+    rows = recorded("thin_sheet")
+    assert [float(row.labels["thickness"]) for row in rows] == list(fields.THICKNESSES)
+    for row, thickness in zip(rows, fields.THICKNESSES, strict=True):
+        errors = fields.sheet_errors(array_module("llvm_ad_rgb"), thickness)
+        for figure, (opacity, _) in zip(row.figures.values(), errors.values(), strict=True):
+            assert figure.value == pytest.approx(opacity, rel=0.1), thickness

@@ -46,7 +46,7 @@ def many_steps(ad: Any) -> list[Finding]:
     """Row 20: rates from 1e-2 to 1e-4 over 1e5 steps, by what a run says of its progress."""
     options = OptimizerConfig(lr=1e-2, lr_final=1e-4, warmup=0)
     config = replace(TrainConfig(), steps=STEPS, max_seconds=None, optimizer=options)
-    trainer: Any = SimpleNamespace(step_count=0, blank_loss=0.0)
+    trainer: Any = SimpleNamespace(config=config, step_count=0, blank_loss=0.0)
     run = Run(Path(), config, cast(Dataset, None), "llvm_ad_rgb", trainer=trainer)
     errors = []
     for step in range(STEPS // 100, STEPS + 1, STEPS // 100):

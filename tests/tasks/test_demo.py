@@ -57,10 +57,10 @@ def test_the_dataset(demo: tuple[Path, dict[str, Any], str]) -> None:
     for split, count in VIEWS.items():
         dataset = load_dataset(folder / "data", split)
         assert len(dataset) == count and dataset.has_alpha
-        alpha = dataset.images[..., 3]
+        alpha = dataset.premultiplied()[..., 3]
         assert (alpha[:, 0] == 0).all()  # empty background
         assert (alpha[:, 10, 10] == 1).all()  # something in the middle
-        assert dataset.images[..., :3].std() > 0.05
+        assert dataset.premultiplied()[..., :3].std() > 0.05
         positions = dataset.cam_to_world[:, :3, 3]
         assert np.linalg.norm(positions, axis=1) == pytest.approx(np.full(count, 4.0))
         assert (positions[:, 2] > 0).all()

@@ -19,16 +19,17 @@ from mi_nerf.cli import main
 from mi_nerf.data import Dataset, load_dataset
 from mi_nerf.formats.field_file import load_field
 from mi_nerf.tasks.ablate import ablate
-from mi_nerf.training import auto, growing
+from mi_nerf.training import auto, shaping
 from mi_nerf.training import run as training
-from mi_nerf.training.auto import SMALL, Decision, choose, decisions_in, fitting_batch, strata
+from mi_nerf.training.auto import Decision, choose, decisions_in
+from mi_nerf.training.batches import step_rng
 from mi_nerf.training.checkpoint import read_checkpoint
 from mi_nerf.training.config import TrainConfig, to_json, with_settings
 from mi_nerf.training.held_back import HeldBack
-from mi_nerf.training.model import resolved_octaves
 from mi_nerf.training.presets import preset
 from mi_nerf.training.run import Run
 from mi_nerf.training.run_folder import CHECKPOINT, CONFIG, FIELD, read_config
+from mi_nerf.training.scaling import resolved, resolved_octaves
 from mi_nerf.training.trainer import Trainer
 from tests.support.datasets import blob_images, orbit_poses, write_blender_dataset
 
@@ -94,42 +95,43 @@ def test_what_follows_from_the_data(diffuse: Dataset) -> None:
     assert config.background == "white" and config.preset == "auto"
 
 
+def asked(decisions: list[Decision]) -> set[str]:
+    return {d.setting for d in decisions if d.open}
+
+
 @pytest.mark.slow
-def test_without_time_for_questions_it_is_preset_fast(diffuse: Dataset) -> None:
-    config, decisions = decided(start(steps=10), diffuse)
-    fast = preset("fast")
-    assert config.network == fast.network
-    assert replace(config.grid, finest=None) == fast.grid
+@pytest.mark.parametrize("budget", [{"steps": 10}, {"max_seconds": 30.0}, {"steps": LONG}])
+def test_it_begins_as_preset_fast(diffuse: Dataset, budget: dict[str, Any]) -> None:
+    """With all sizes that follow from the images; only a long run asks about the model."""
+    config, decisions = decided(start(**budget), diffuse)
+    fast = resolved(preset("fast"), diffuse)
+    assert config.network == fast.network and config.occupancy == fast.occupancy
+    assert config.sampling == fast.sampling and config.pyramid == fast.pyramid
+    assert config.grid is not None and replace(config.grid, finest=None) == fast.grid
     assert all(decision.reason for decision in decisions)
-    _, decisions = decided(start(steps=10**6), diffuse.subset(range(3)))
-    assert "3 views, too few to hold any back" in str(chosen_for("network.depth", decisions))
-    config, _ = decided(start(max_seconds=30.0), diffuse)
-    assert config.network == fast.network and replace(config.grid, finest=None) == fast.grid
+    model = {"network.view_dependent", "grid.log2_entries"}
+    long = budget.get("steps") == LONG
+    assert asked(decisions) == {"sampling.render_samples"} | (model if long else set())
+    why = chosen_for("grid.log2_entries", decisions).reason
+    assert ("too few to ask" in why) == (not long)
 
 
 @pytest.mark.slow
-def test_with_time_it_begins_small(diffuse: Dataset) -> None:
-    for budget in ({"max_seconds": 60.0}, {"steps": LONG}):
-        config, decisions = decided(start(**budget), diffuse)
-        assert not config.network.view_dependent and config.network.view_depth == 0
-        assert config.grid.log2_entries == preset("fast").grid.log2_entries - 2
-        assert config.network.depth == preset("fast").network.depth
-        asked = {d.setting for d in decisions if d.reason.startswith(SMALL)}
-        assert asked == {
-            "network.view_dependent",
-            "grid.log2_entries",
-            "network.depth",
-            "sampling.render_samples",
-        }
+def test_of_few_views_none_is_held_back(diffuse: Dataset) -> None:
+    _, decisions = decided(start(steps=LONG), diffuse.subset(range(3)))
+    assert asked(decisions) == {"sampling.render_samples"}
+    why = chosen_for("network.view_dependent", decisions).reason
+    assert "3 views, too few to hold any back" in why
 
 
 @pytest.mark.slow
 def test_fourier_features_begin_with_few_octaves(diffuse: Dataset) -> None:
     box = "box=-1,-1,-1,1,1,1"
     config, decisions = decided(start("grid=none", box, steps=LONG), diffuse)
-    assert config.position.frequencies == 4
+    assert config.position is not None and config.position.frequencies == 4
     octaves = resolved_octaves(diffuse, (-1, -1, -1), (1, 1, 1))
     assert f"the images resolve {octaves}" in chosen_for("position.frequencies", decisions).reason
+    assert {"position.frequencies", "network.view_dependent"} <= asked(decisions)
 
 
 @pytest.mark.slow
@@ -138,9 +140,9 @@ def test_what_the_user_sets_is_neither_asked_nor_changed(diffuse: Dataset) -> No
     settings += ["sampling.samples=40", "box=-1,-1,-1,1,1,1", "sampling.render_samples=100"]
     given = {s.partition("=")[0] for s in settings}
     config, decisions = decided(start(*settings, steps=LONG), diffuse, given=given)
-    assert not given & set(chosen(decisions))
-    assert not [d for d in decisions if d.reason.startswith(SMALL)]
-    assert config.network == preset("fast").network and config.grid.log2_entries == 16
+    assert not given & set(chosen(decisions)) and not asked(decisions)
+    assert config.network == preset("fast").network
+    assert config.grid is not None and config.grid.log2_entries == 16
     assert config.sampling.samples == 40 and config.sampling.render_samples == 100
 
 
@@ -153,32 +155,30 @@ def test_the_choice_is_that_of_a_trainer_left_alone(diffuse: Dataset) -> None:
     assert float(trainers[0].step(1e-2).loss[0]) == float(trainers[1].step(1e-2).loss[0])
 
 
-def test_strata_follow_the_grid_and_the_space() -> None:
-    assert strata(32, 0.2) == strata(128, 1.0) == 64
-    assert strata(256, 0.2) == 96
-    assert strata(1024, 1.0) == 64
-
-
-def test_the_batch_fits_into_memory() -> None:
-    assert fitting_batch(16384, 64, 64 << 30) == 16384
-    assert fitting_batch(16384, 64, 256 << 20) == 4096
-    assert fitting_batch(16384, 64, 1) == 64
-
-
 # ---- Views held back ------------------------------------------------------------------
+
+
+def views_seen(trainer: Trainer, rays: int = 4000) -> set[int]:
+    """Numbers of the views whose pixels training draws: rays begin where their camera is."""
+    drawn = trainer._source.draw(rays, step_rng(llvm.Float, 3, 0))
+    o = np.array(drawn.o).T
+    cameras = trainer._images._poses.numpy().reshape(VIEWS, -1)
+    centers = np.array([[row[3], row[7], row[11]] for row in cameras])
+    return set(np.argmin(np.linalg.norm(o[:, None] - centers[None], axis=2), axis=1).tolist())
 
 
 @pytest.mark.slow
 def test_views_are_held_back_and_given_back(diffuse: Dataset) -> None:
     trainer = Trainer(start(*SMALL_MODEL), diffuse, llvm)
     held = HeldBack(diffuse, trainer)
-    assert trainer._source._views == VIEWS
+    everything = set(range(VIEWS))
+    assert views_seen(trainer) == everything
     held.hold()
-    names, others = set(held.views.names), set(held.others.names)
-    assert len(names) == 4 and not names & others and names | others == set(diffuse.names)
-    assert trainer._source._views == VIEWS - 4
+    assert len(held.views) == 2
+    assert set(held.views) | set(held.others) == everything
+    assert views_seen(trainer) == everything - set(held.views)
     held.give_back()
-    assert trainer._source._views == VIEWS
+    assert views_seen(trainer) == everything
 
 
 @pytest.mark.slow
@@ -205,16 +205,16 @@ def test_what_a_model_would_lose(diffuse: Dataset) -> None:
 
 @pytest.fixture
 def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything is asked within a few dozen steps."""
+    """Everything is asked within a few dozen steps, and light is even where anyone asks."""
     monkeypatch.setattr(auto, "SHORTEST_STEPS", 30)
-    monkeypatch.setattr(growing, "_PACED", (1, 2))
-    monkeypatch.setattr(growing, "FIRST_STEPS", 5)
-    monkeypatch.setattr(growing, "TRIAL_STEPS", 3)
+    monkeypatch.setattr(shaping, "ASKED_STEPS", 5)
+    monkeypatch.setattr(shaping, "MOST_LOST", 99.0)
+    monkeypatch.setattr(shaping, "AT_ONCE", 0.3)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("brisk")
-def test_a_run_grows_and_says_why(
+def test_a_run_takes_shape_and_says_why(
     diffuse: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "run"
@@ -228,7 +228,9 @@ def test_a_run_grows_and_says_why(
     values = dict(training_leaves(config))
     for name, entry in settled.items():
         assert values[name] == entry["value"], name
-        assert not entry["reason"].startswith(SMALL), entry
+        assert not entry["open"], entry
+    assert settled["network.view_dependent"]["value"] is False
+    assert settled["grid.log2_entries"]["value"] < 16
     assert main(["info", str(out)]) == 0
     shown = capsys.readouterr().out
     for entry in record["auto"]:
@@ -246,13 +248,13 @@ def training_leaves(config: TrainConfig) -> dict[str, Any]:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("brisk")
-def test_an_interrupted_run_goes_on_with_what_has_grown(diffuse: Dataset, tmp_path: Path) -> None:
+def test_an_interrupted_run_goes_on_in_its_shape(diffuse: Dataset, tmp_path: Path) -> None:
     """Also if it was killed after the checkpoint was written and before config.json was."""
     config = start(*SMALL_MODEL[:1], *SMALL_MODEL[3:], steps=60)
     out = tmp_path / "run"
     run = training.start(diffuse.path, out, config, "llvm_ad_rgb")
     begun = (out / CONFIG).read_text()
-    stop_once(run, lambda: run.trainer.config.network.view_dependent)  # on trial
+    stop_once(run, lambda: not run.trainer.config.network.view_dependent)
     step = run.trainer.step_count
     assert step < 60
     _, description = read_checkpoint(out / CHECKPOINT)
@@ -263,11 +265,11 @@ def test_an_interrupted_run_goes_on_with_what_has_grown(diffuse: Dataset, tmp_pa
     for name, tensor in run.trainer.parameters.items():
         np.testing.assert_array_equal(np.array(again.trainer.parameters[name]), np.array(tensor))
     found = chosen(again.decisions)
-    assert found["network.view_dependent"] is True
+    assert found["network.view_dependent"] is False
     again.train(show_bar=False)
     assert again.progress == 1 and again.trainer.step_count == 60
     final, _ = read_config(out)
-    assert final == again.config and final.network.view_dependent
+    assert final == again.config and not final.network.view_dependent
 
 
 def stop_once(run: Run, due: Callable[[], bool]) -> None:
@@ -288,7 +290,7 @@ def test_a_finished_run_asks_nothing_more(diffuse: Dataset, tmp_path: Path) -> N
     before = json.loads((tmp_path / "run/config.json").read_text())
     longer = replace(config, steps=5)
     again = training.start(diffuse.path, tmp_path / "run", longer, "llvm_ad_rgb", resume=True)
-    assert again.trainer._source._views == len(diffuse)
+    assert views_seen(again.trainer) == set(range(VIEWS))
     again.train(show_bar=False)
     assert again.trainer.step_count == 5
     assert again.config == replace(first.config, steps=5)
@@ -298,12 +300,12 @@ def test_a_finished_run_asks_nothing_more(diffuse: Dataset, tmp_path: Path) -> N
 def test_reasons_that_no_longer_hold_are_not_repeated() -> None:
     config = start("network.view_dependent=true")
     said = [
-        {"setting": "network.view_dependent", "value": False, "reason": f"{SMALL}, so"},
+        {"setting": "network.view_dependent", "value": False, "reason": "so", "open": True},
         {"setting": "network.depth", "value": 1, "reason": "as it is"},
     ]
     found = decisions_in({"auto": said}, config)
     assert found[1] == Decision(**said[1])
-    assert found[0].value is True and not found[0].reason.startswith(SMALL)
+    assert found[0].value is True and "interrupted" in found[0].reason and not found[0].open
     for other in ("none", [{"why": 1}], [3]):
         assert decisions_in({"auto": other}, config) == []
 

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mi_nerf.fields.network import GRID
 from mi_nerf.training.optimizer import Adam
 from mi_nerf.training.orthogonal import is_hidden, orthogonalized, update_size
 from tests.support.published import KerasAdam
@@ -119,3 +120,64 @@ def test_a_step_that_is_not_finite_changes_nothing(ad: Any) -> None:
     for name, value in before.items():
         assert np.array_equal(np.array(parameters[name]), value)
     assert all(np.isfinite(v).all() for v in optimizer.state().values())
+
+
+# ---- Tables ------------------------------------------------------------------
+
+
+def test_only_entries_with_gradients_move(ad: Any) -> None:
+    """Adam entry by entry in double precision, with the count of all accepted steps."""
+    rng, shape, rate = np.random.default_rng(3), (50, 4), 1e-2
+    p = rng.normal(size=shape)
+    m, v = np.zeros(shape), np.zeros(shape)
+    parameters = {GRID: ad.TensorXf(p.astype(np.float32))}
+    optimizer = Adam(parameters, beta1=0.9, beta2=0.99, epsilon=1e-15)
+    for count in range(1, 7):
+        g = np.where(rng.random(shape) < 0.7, 0, rng.normal(size=shape)).astype(np.float32)
+        optimizer.zero_grad()
+        dr.set_grad(parameters[GRID], ad.TensorXf(g))
+        before = {n: a.copy() for n, a in optimizer.state().items()}
+        assert optimizer.step(rate, ad.Bool(True))[0]
+        seen = g != 0
+        m[seen] = (0.9 * m + 0.1 * g)[seen]
+        v[seen] = (0.99 * v + 0.01 * g.astype(float) ** 2)[seen]
+        with np.errstate(invalid="ignore"):
+            change = rate * (m / (1 - 0.9**count)) / np.sqrt(v / (1 - 0.99**count))
+        p[seen] -= change[seen]
+        assert np.abs(np.array(parameters[GRID], float) - p).max() < 1e-5
+        after = optimizer.state()
+        for moment in (f"first.{GRID}", f"second.{GRID}"):
+            assert np.array_equal(after[moment][~seen], before[moment][~seen])
+
+
+@pytest.mark.parametrize("entry", [np.nan, np.inf, -np.inf, 1e20])
+def test_one_entry_whose_square_is_not_finite(ad: Any, entry: float) -> None:
+    parameters = {GRID: dr.ones(ad.TensorXf, (30, 4)), "a.bias": dr.ones(ad.TensorXf, (3,))}
+    optimizer = Adam(parameters)
+    gradient = np.ones((30, 4), np.float32)
+    gradient[17, 2] = entry
+    for value, accepted in ((gradient, False), (np.ones_like(gradient), True)):
+        optimizer.zero_grad()
+        dr.set_grad(parameters[GRID], ad.TensorXf(value))
+        dr.set_grad(parameters["a.bias"], ad.TensorXf(np.ones(3, np.float32)))
+        assert optimizer.step(0.1, ad.Bool(True))[0] == accepted
+        moved = [np.array(p) != 1 for p in parameters.values()]
+        assert all(m.all() if accepted else not m.any() for m in moved)
+    assert optimizer.state()["steps"][0] == 1
+
+
+def test_a_table_is_passed_over_twice(ad: Any) -> None:
+    """Once to look for what is not finite, once to update; nothing is compiled anew."""
+    parameters = {GRID: dr.ones(ad.TensorXf, (700, 4)), "a.bias": dr.ones(ad.TensorXf, (3,))}
+    dr.eval(parameters)
+    optimizer = Adam(parameters)
+    for step in range(3):
+        optimizer.zero_grad()
+        for p in parameters.values():
+            dr.set_grad(p, dr.opaque(ad.TensorXf, 0.5, shape=p.shape))
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            optimizer.step(0.01 / (step + 1), ad.Bool(True))
+            history = dr.kernel_history()
+    assert len([entry for entry in history if entry["size"] == 2800]) == 2
+    assert not any(entry.get("cache_hit", True) == 0 for entry in history)

@@ -36,8 +36,8 @@ class Recorded:
         self.gradients: dict[str, np.ndarray] = {}
         draw, integrate, update = self.trainer._draw, module.integrate, Adam.step
 
-        def record_draw() -> Any:
-            self.drawn = draw()
+        def record_draw(progress: float) -> Any:
+            self.drawn = draw(progress)
             return self.drawn
 
         def record_samples(evaluation: Any, samples: Any) -> Any:
