@@ -63,12 +63,8 @@ class HeldBack:
 
     def lost_as(self, config: TrainConfig) -> float:
         """What the trained field would lose at once in the shape of another configuration, dB."""
-        trainer = self._trainer
-        model = trainer.in_shape_of(config)
-        weights = {n: w for n, w in model.weights.items() if not n.startswith("coarse.")}
-        tensors = type(next(iter(trainer.parameters.values())))
-        field = NeuralField(model.field, weights, tensors, trainer.field.coarse)
-        return self.quality() - _decibels(trainer.validate(self._pixels, field))
+        field = self._trainer.field_in_shape_of(config)
+        return self.quality() - _decibels(self._trainer.validate(self._pixels, field))
 
     def lost_even(self) -> float:
         """What the trained field loses if it sends the same light in all directions, dB."""

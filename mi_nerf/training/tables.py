@@ -83,6 +83,8 @@ class TableMap:
         empty = np.zeros(0, np.int64)
         self._source, self._target = (np.concatenate([empty, *n]) for n in (sources, targets))
         self._entries = new.entries()
+        counts = np.bincount(self._target, minlength=1)
+        self._merges = bool(counts.max() > 1)
 
     def carry(self, rows: Array, importance: Array | None = None) -> Array:
         """The rows of the new layout; zeros where the old one has nothing.
@@ -94,15 +96,20 @@ class TableMap:
         """
         picked = rows[self._source]
         result = np.zeros((self._entries, *rows.shape[1:]), rows.dtype)
-        if len(np.unique(self._target)) == len(self._target):
+        if not self._merges:
             result[self._target] = picked
             return result
         weight = np.ones(picked.shape) if importance is None else importance[self._source]
-        weight = weight.astype(np.float64) + 1e-12 * max(float(weight.max(initial=0)), 1e-30)
-        total, sums = (np.zeros(result.shape) for _ in range(2))
-        np.add.at(total, self._target, weight)
-        np.add.at(sums, self._target, weight * picked)
-        return np.divide(sums, total, out=sums, where=total > 0).astype(rows.dtype)
+        weight = weight + 1e-12 * max(float(weight.max(initial=0)), 1e-30)
+        total, sums = self._added(weight), self._added(weight * picked)
+        mean = np.divide(sums, total, out=sums, where=total > 0)
+        return mean.reshape(result.shape).astype(rows.dtype)
+
+    def _added(self, rows: Array) -> Array:
+        """(new entries, …) sums, in double precision, of the rows that become one."""
+        columns = rows.reshape(len(rows), -1).astype(np.float64)
+        sums = [np.bincount(self._target, c, self._entries) for c in columns.T]
+        return np.stack(sums, axis=-1)
 
 
 def _pairs(old: Level, new: Level) -> tuple[Array, Array]:

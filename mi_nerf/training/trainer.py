@@ -27,7 +27,7 @@ from ..march.samples import Samples
 from ..march.settings import MarchSettings
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
-from .growth import Snapshot, reshaped
+from .growth import Reshaping, Snapshot, field_in_shape, reshaped
 from .loss_scale import LossScale
 from .losses import LOSSES, squared_error
 from .model import carved_cells, field_config
@@ -202,11 +202,27 @@ class Trainer:
 
     def in_shape_of(self, config: TrainConfig) -> Snapshot:
         """The model that :meth:`become` would go on with; changes nothing."""
-        seen = None
-        if self.config.network.view_dependent and not config.network.view_dependent:
-            seen = self._mean_direction()
-        seed = config.seed + 1000 * self.attempt + self.step_count
-        return reshaped(self.snapshot(), config, seed, seen)
+        return reshaped(self.snapshot(), config, self._shape_seed(), self._left(config))
+
+    def field_in_shape_of(self, config: TrainConfig) -> NeuralField:
+        """The field alone that :meth:`become` would go on with; changes nothing."""
+        model = self.snapshot()
+        field = field_in_shape(model.field, config)
+        weights = Reshaping(model.field, field).weights(
+            {n: w for n, w in model.weights.items() if not n.startswith("coarse.")},
+            self._shape_seed(),
+            importance=prefixed(model.optimizer, "second."),
+            direction=self._left(config),
+        )
+        return NeuralField(field, weights, self._backend.TensorXf, self.field.coarse)
+
+    def _shape_seed(self) -> int:
+        return self.config.seed + 1000 * self.attempt + self.step_count
+
+    def _left(self, config: TrainConfig) -> np.ndarray[Any, Any] | None:
+        """What a field that is to see no directions any more sees in their place."""
+        loses = self.config.network.view_dependent and not config.network.view_dependent
+        return self._mean_direction() if loses else None
 
     def snapshot(self) -> Snapshot:
         """The model as it is now, for :meth:`go_on_from`."""

@@ -55,7 +55,7 @@ class Script:
     """What views held back say of a model."""
 
     even: float = 1.0  # lost with light averaged over directions
-    lost: Callable[[TrainConfig, int], float] = lambda config, step: 1.0  # in the shape of
+    lost: Callable[[TrainConfig, int], float] = lambda config, step: 2.0  # in the shape of
     strata: dict[int, float] = field(default_factory=lambda: {64: 29.0, 96: 29.5})
     holds: list[tuple[int, bool]] = field(default_factory=list)
 
@@ -121,18 +121,18 @@ def test_it_stays_preset_fast_where_everything_is_needed(script: Script) -> None
     assert trainer.history == [(0, config)]
     assert not any(d.open for d in decisions)
     assert script.holds == [(0, True), (ASKED[-1] * 10000, False)]
-    assert "would lose 1.00 dB without directions" in reason(decisions, "network.view_dependent")
-    assert "1.00 with 2^15" in reason(decisions, "grid.log2_entries")
+    assert "would lose 2.00 dB, at once" in reason(decisions, "network.view_dependent")
+    assert "2.00 with 2^15" in reason(decisions, "grid.log2_entries")
 
 
 def test_what_is_not_missed_goes_at_once_and_together(script: Script) -> None:
-    script.even, script.lost = 0.1, lambda config, step: 0.1 * (16 - entries(config))
+    script.even, script.lost = 0.1, lambda config, step: 0.2 * (16 - entries(config))
     config, decisions = begun()
     trainer = shaped(config, decisions)
     assert [step for step, _ in trainer.history] == [0, ASKED[0] * 10000]
     assert not trainer.config.network.view_dependent
     assert trainer.config.network.view_depth == 1
-    assert entries(trainer.config) == 11  # 0.5 dB at once; the next one 0.6
+    assert entries(trainer.config) == 11  # 1.0 dB at once; the next one 1.2
     why = reason(decisions, "network.view_dependent")
     assert why.startswith("taken out: after 3000 steps") and "0.10 with light averaged" in why
     assert "after 3000 steps" in reason(decisions, "grid.log2_entries")
@@ -143,6 +143,20 @@ def test_directions_go_where_light_is_even(script: Script, less: float, needed: 
     script.even, script.lost = MOST_LOST + less, lambda config, step: 0.0
     config, decisions = begun()
     assert shaped(config, decisions).config.network.view_dependent == needed
+
+
+@pytest.mark.parametrize("mean", [0.9, 1.1])
+def test_a_large_change_is_not_made_even_if_light_is_even(script: Script, mean: float) -> None:
+    """What the mean of directions costs at once does not count against smaller tables."""
+
+    def lost(config: TrainConfig, step: int) -> float:
+        return mean * (not config.network.view_dependent) + 0.4 * (16 - entries(config))
+
+    script.even, script.lost = 0.0, lost
+    config, decisions = begun()
+    trainer = shaped(config, decisions, until=0.4)
+    assert trainer.config.network.view_dependent == (mean > AT_ONCE)
+    assert entries(trainer.config) == 14  # 0.8 dB at once
 
 
 def test_directions_that_show_late_are_kept(script: Script) -> None:
