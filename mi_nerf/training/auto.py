@@ -12,7 +12,7 @@ busier one, may decide otherwise.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from ..data import Dataset
@@ -40,6 +40,11 @@ class Decision:
 
     def __str__(self) -> str:
         return f"{self.setting} = {as_text(self.value, '.4g')}: {self.reason}"
+
+    def as_json(self) -> dict[str, Any]:
+        """What ``config.json`` holds of it."""
+        found = asdict(self)
+        return found if self.open else {n: v for n, v in found.items() if n != "open"}
 
 
 def record(decisions: list[Decision], new: Decision) -> None:

@@ -20,7 +20,7 @@ FEWEST_VIEWS = 5  # with fewer there is none to hold back
 _MOST_VIEWS, _ONE_OF = 8, 8  # to hold back: one of so many
 _PIXELS = 8192  # held-back ones that judge a field, at most
 _DIRECTIONS = 8  # from which light is averaged
-_EVEN_PIXELS = 4096  # for that, at most
+_EVEN_PIXELS = 2048  # for that, at most
 _SEED = 77  # of the choice of pixels, always the same
 
 
@@ -36,6 +36,7 @@ class HeldBack:
         self.views = [(2 * i + 1) * len(dataset) // (2 * count) for i in range(count)]
         self.others = sorted(set(range(len(dataset))) - set(self.views))
         self._trainer, self.holds = trainer, False
+        self._known: tuple[tuple[int, TrainConfig], float] | None = None  # when, and what
         self._cameras = dataset.cam_to_world[self.others, :3, 3]
         size = dataset.intrinsics
         most = count * size.width * size.height
@@ -61,10 +62,17 @@ class HeldBack:
         """
         return _decibels(self._trainer.validate(self._pixels, samples=samples))
 
+    def _present(self) -> float:
+        """The quality of the field as it is now, asked once a step."""
+        now = (self._trainer.step_count, self._trainer.config)
+        if self._known is None or self._known[0] != now:
+            self._known = (now, self.quality())
+        return self._known[1]
+
     def lost_as(self, config: TrainConfig) -> float:
         """What the trained field would lose at once in the shape of another configuration, dB."""
         field = self._trainer.field_in_shape_of(config)
-        return self.quality() - _decibels(self._trainer.validate(self._pixels, field))
+        return self._present() - _decibels(self._trainer.validate(self._pixels, field))
 
     def lost_even(self) -> float:
         """What the trained field loses if it sends the same light in all directions, dB."""

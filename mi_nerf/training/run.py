@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -351,7 +351,7 @@ class Run:
             **self._record,
             "settings": {**to_json(self.config), **budget},
             "field": field,
-            "auto": [asdict(decision) for decision in self.decisions],
+            "auto": [decision.as_json() for decision in self.decisions],
         }
 
     # ---------------------------------- Collapse ----------------------------------
@@ -504,7 +504,7 @@ def _record(run: Run, dataset: Dataset) -> dict[str, Any]:
             "upper": field.upper,
             "parameters": field.parameter_count(),
         },
-        **({"auto": [asdict(d) for d in run.decisions]} if run.decisions else {}),
+        **({"auto": [d.as_json() for d in run.decisions]} if run.decisions else {}),
         "variant": run.variant,
         "versions": {
             "mi_nerf": __version__,
