@@ -1,11 +1,10 @@
 """How a model of preset ``auto`` takes shape while it trains.
 
-It begins as that of preset ``fast``, and views are held back. Twice they are asked what they
-would lose, at once, if something were taken out: directions, or half of the entries of every
-level of the hash grid, and half of those again. What they would miss little goes, in place (see
-:mod:`mi_nerf.training.growth`), and training goes on; a smaller model makes up for the most of
-what it loses at once. That is why comparisons are of the same weights: the quality of two
-models in training differs by chance, by tenths of a decibel at these learning rates.
+It begins as that of preset ``fast``, and views are held back. Now and then they are asked what
+they would lose, at once, if half of the entries of every level of the hash grid were taken out,
+and at last, when colours are known, directions. What they would miss little goes, in place (see
+:mod:`mi_nerf.training.growth`), and training goes on; a smaller model makes up for most of what
+it loses at once. Comparisons are of the same weights, so that chance has no part in them.
 
 Octaves of Fourier features are added instead, two at a time, as long as the field would miss the
 last ones: it cannot do without those that it has begun with.
@@ -31,16 +30,19 @@ NEGLIGIBLE = 0.02  # dB: what costs less is taken out at the end
 # dB with light averaged over directions. Of 400 steps on 200×200 pixels: a diffuse scene lost
 # 0.0 and 0.14 dB, a glossy one 0.35 and 0.45 dB.
 MOST_LOST = 0.2
-# dB that something taken out may cost before the rest has learnt to do without. Of L dB lost so
-# after 30 % of the steps, 0.02 L² to 0.06 L² were left at the end: Lego (100×100, 900 steps) 0.72
-# and 2.1 dB, 0.03 and 0.20 at the end; arches (600 steps) 1.9 and 3.3 dB, 0.08 and 0.20.
-AT_ONCE = 1.0
-ASKED = (0.3, 0.5)  # shares of the budget after which views held back are asked,
-ASKED_STEPS = 300  # and no earlier than after so many steps
+MOST_CHANGED = 1.0  # dB that the mean of directions in their place may cost at once
+# dB that smaller tables may cost each time before they have learnt. Of L dB lost so after 30 % of
+# the steps, 0.02 L² to 0.06 L² were left at the end: Lego (100×100, 900 steps) 0.72 and 2.1 dB,
+# 0.03 and 0.20 at the end; arches (600 steps) 1.9 and 3.3 dB, 0.08 and 0.20.
+AT_ONCE = 0.6
+ASKED = (0.2, 0.3, 0.4, 0.5)  # shares of the budget after which views held back are asked,
+ASKED_STEPS = 200  # no earlier than after so many steps,
+APART = 50  # nor sooner than so many after the last time
 TRIAL = 0.03  # share of the budget for which something new is trained before it is judged,
 TRIAL_STEPS = 60  # and no fewer steps than that
 SETTLED = 0.6  # share of the budget after which nothing changes
 LAST = 0.96  # share of the budget after which strata are counted
+_FAR = 2  # times as much lost, and nobody asks again
 _FEWEST_ENTRIES = 10  # log2 of those of a level
 _OCTAVES, _MOST_OCTAVES = 2, 12  # added at a time; and in all
 
@@ -90,11 +92,12 @@ class Shaping:
         held = self._held
         if held.holds:
             yield from self._octaves(held)
+            earliest = ASKED_STEPS
             for share in ASKED:
-                start = self._trainer.step_count
-                yield from self._until(share, ASKED_STEPS if share == ASKED[0] else start)
+                yield from self._until(share, earliest)
                 if self._progress() < SETTLED:
                     self._take_out(held, last=share == ASKED[-1])
+                earliest = self._trainer.step_count + APART
             self._close()
             held.give_back()
             yield
@@ -128,23 +131,23 @@ class Shaping:
     def _take_out(self, held: HeldBack, last: bool) -> None:
         """Directions and entries that are not missed."""
         found: dict[str, Any] = {}
-        lost = self._directions(held, found, last)
+        lost = self._directions(held, found) if last else 0.0
         self._entries(held, found, lost, last)
         if found:
             self._trainer.become(self._with(found))
 
-    def _directions(self, held: HeldBack, found: dict[str, Any], last: bool) -> float:
+    def _directions(self, held: HeldBack, found: dict[str, Any]) -> float:
         """They go if light is even; returns what their mean in their place costs at once, dB."""
         if not is_open(self._decisions, _DIRECTIONS):
             return 0.0
         mean, even = held.lost_as(self._with({_DIRECTIONS: False})), None
         why = f"after {self._trainer.step_count} steps views held back would lose {mean:.2f} dB, "
         why += "at once, with the mean of directions in their place"
-        if mean <= AT_ONCE:
+        if mean <= MOST_CHANGED:
             even = held.lost_even()
             why += f", and {even:.2f} with light averaged over them"
         if even is None or even > MOST_LOST:
-            self._say(_DIRECTIONS, True, why, still=not last)
+            self._say(_DIRECTIONS, True, why)
             return 0.0
         found[_DIRECTIONS] = False
         self._say(_DIRECTIONS, False, f"taken out: {why}")
@@ -157,19 +160,18 @@ class Shaping:
         grid = self._trainer.config.grid
         if grid is None or not is_open(self._decisions, _ENTRIES):
             return
-        entries, said = grid.most_entries.bit_length() - 1, []
+        entries, said, lost = grid.most_entries.bit_length() - 1, [], 0.0
         for fewer in range(entries - 1, _FEWEST_ENTRIES - 1, -1):
             lost = held.lost_as(self._with({**found, _ENTRIES: fewer})) - lost_before
             said.append(f"{lost:.2f} with 2^{fewer}")
             if lost > AT_ONCE:
                 break
             found[_ENTRIES] = entries = fewer
-        why = f"after {self._trainer.step_count} steps views held back would lose, at once, "
-        why += ", ".join(said) + " dB"
+        why = f"after {self._trainer.step_count} steps {', '.join(said)} dB"
         earlier = next(d.reason for d in self._decisions if d.setting == _ENTRIES)
-        if earlier.startswith("after"):
-            why = f"{earlier}; {why}"
-        self._say(_ENTRIES, entries, why, still=not last)
+        first = "views held back would lose, at once,"
+        why = f"{earlier}; {why}" if earlier.startswith(first) else f"{first} {why}"
+        self._say(_ENTRIES, entries, why, still=not last and lost <= _FAR * AT_ONCE)
 
     def _octaves(self, held: HeldBack) -> Iterator[None]:
         """Two more, as long as the field would miss the last ones."""

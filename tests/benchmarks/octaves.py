@@ -11,6 +11,7 @@ where none is given. ``mi-nerf ablate --rows L=2 L=4 …`` does the same for the
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -81,7 +82,10 @@ def _quality(data: Path, octaves: int, seed: int, options: argparse.Namespace) -
     config = replace(config, downscale=options.downscale)
     variant = choose_variant()
     with tempfile.TemporaryDirectory() as out:
-        training.start(data, Path(out) / "run", config, variant).train(show_bar=False)
+        run = training.start(data, Path(out) / "run", config, variant)
+        run.train(show_bar=False)
+        if run.interrupted:
+            sys.exit("interrupted: nothing is written")
         return evaluate(Path(out) / "run", variant, split=options.split, views=options.views)
 
 

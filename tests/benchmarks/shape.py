@@ -11,6 +11,7 @@ protocol and writes a row a scene to docs/results/shape.json.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from dataclasses import dataclass, replace
@@ -97,6 +98,8 @@ def _outcome(data: Path, name: str, seed: int, options: argparse.Namespace) -> O
         before = time.process_time()
         run = training.start(data, folder, config, variant)
         run.train(show_bar=False)
+        if run.interrupted:
+            sys.exit("interrupted: nothing is written")
         seconds = time.process_time() - before
         for decision in run.decisions:
             print(f"{data.name}, seed {seed}: {decision}", flush=True)

@@ -209,7 +209,9 @@ def brisk(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(auto, "SHORTEST_STEPS", 30)
     monkeypatch.setattr(shaping, "ASKED_STEPS", 5)
     monkeypatch.setattr(shaping, "MOST_LOST", 99.0)
-    monkeypatch.setattr(shaping, "AT_ONCE", 99.0)
+    monkeypatch.setattr(shaping, "APART", 3)
+    monkeypatch.setattr(shaping, "MOST_CHANGED", 99.0)
+    monkeypatch.setattr(shaping, "AT_ONCE", 0.3)
 
 
 @pytest.mark.slow
