@@ -93,7 +93,7 @@ class Shaping:
         if held.holds:
             yield from self._octaves(held)
             earliest = ASKED_STEPS
-            for share in ASKED:
+            for share in self._shares():
                 yield from self._until(share, earliest)
                 if self._progress() < SETTLED:
                     self._take_out(held, last=share == ASKED[-1])
@@ -104,6 +104,11 @@ class Shaping:
         while self._progress() < LAST:
             yield
         self._strata(held)
+
+    def _shares(self) -> list[float]:
+        """When to ask: not of a field that has only seen coarser images what it would miss."""
+        pyramid = self._trainer.config.pyramid
+        return [share for share in ASKED if not pyramid.levels or share > pyramid.until]
 
     def _until(self, share: float, step: int) -> Iterator[None]:
         """Trains until a share of the budget is spent and a step is reached, as far as it may."""
@@ -146,7 +151,7 @@ class Shaping:
         if mean <= MOST_CHANGED:
             even = held.lost_even()
             why += f", and {even:.2f} with light averaged over them"
-        if even is None or even > MOST_LOST:
+        if even is None or not even <= MOST_LOST:
             self._say(_DIRECTIONS, True, why)
             return 0.0
         found[_DIRECTIONS] = False
@@ -164,14 +169,15 @@ class Shaping:
         for fewer in range(entries - 1, _FEWEST_ENTRIES - 1, -1):
             lost = held.lost_as(self._with({**found, _ENTRIES: fewer})) - lost_before
             said.append(f"{lost:.2f} with 2^{fewer}")
-            if lost > AT_ONCE:
+            if not lost <= AT_ONCE:  # NaN, too
                 break
             found[_ENTRIES] = entries = fewer
         why = f"after {self._trainer.step_count} steps {', '.join(said)} dB"
         earlier = next(d.reason for d in self._decisions if d.setting == _ENTRIES)
         first = "views held back would lose, at once,"
         why = f"{earlier}; {why}" if earlier.startswith(first) else f"{first} {why}"
-        self._say(_ENTRIES, entries, why, still=not last and lost <= _FAR * AT_ONCE)
+        more = lost <= _FAR * AT_ONCE and entries > _FEWEST_ENTRIES
+        self._say(_ENTRIES, entries, why, still=more and not last)
 
     def _octaves(self, held: HeldBack) -> Iterator[None]:
         """Two more, as long as the field would miss the last ones."""

@@ -56,7 +56,7 @@ class Script:
     """What views held back say of a model."""
 
     even: float = 1.0  # lost with light averaged over directions
-    lost: Callable[[TrainConfig, int], float] = lambda config, step: 2.0  # in the shape of
+    lost: Callable[[TrainConfig, int, TrainConfig], float] = lambda config, step, now: 2.0  # in the shape of
     strata: dict[int, float] = field(default_factory=lambda: {64: 29.0, 96: 29.5})
     holds: list[tuple[int, bool]] = field(default_factory=list)
 
@@ -81,7 +81,7 @@ def script(monkeypatch: pytest.MonkeyPatch) -> Script:
             return said.strata.get(samples, 30.0)
 
         def lost_as(self, config: TrainConfig) -> float:
-            return said.lost(config, self._trainer.step_count)
+            return said.lost(config, self._trainer.step_count, self._trainer.config)
 
         def lost_even(self) -> float:
             return said.even
@@ -128,7 +128,7 @@ def test_it_stays_preset_fast_where_everything_is_needed(script: Script) -> None
 
 
 def test_what_is_nearly_needed_is_asked_about_again(script: Script) -> None:
-    script.lost = lambda config, step: 1.5 * AT_ONCE
+    script.lost = lambda config, step, now: 1.5 * AT_ONCE
     config, decisions = begun()
     trainer = shaped(config, decisions)
     assert entries(trainer.config) == 16
@@ -136,23 +136,35 @@ def test_what_is_nearly_needed_is_asked_about_again(script: Script) -> None:
 
 
 def test_what_is_not_missed_goes_at_once_and_together(script: Script) -> None:
-    """0.2 dB for each halving at 2000 steps, more later, and directions when colours are known."""
+    """0.2 dB for each halving at 2000 steps, more later; directions when colours are known."""
     script.even = 0.1
-    script.lost = lambda config, step: 1e-4 * step * (16 - entries(config))
+    script.lost = lambda config, step, now: 0.99e-4 * step * (entries(now) - entries(config))
     config, decisions = begun()
     trainer = shaped(config, decisions)
-    assert [step for step, _ in trainer.history] == [0, ASKED[0] * 10000, ASKED[-1] * 10000]
-    first, second = (c for _, c in trainer.history[1:])
-    assert entries(first) == 13  # 0.6 dB at once; the next one 0.8
-    assert first.network.view_dependent and not second.network.view_dependent
-    assert second.grid == first.grid and second.network.view_depth == 1
+    assert [step for step, _ in trainer.history] == [0, *(share * 10000 for share in ASKED)]
+    shapes = [c for _, c in trainer.history[1:]]
+    assert [entries(c) for c in shapes] == [13, 11, 10, 10]  # 0.6, 0.6, 0.4 dB at once
+    assert [c.network.view_dependent for c in shapes] == [True, True, True, False]
+    assert shapes[-1].network.view_depth == 1
     why = reason(decisions, "network.view_dependent")
     assert why.startswith("taken out: after 5000 steps") and "0.10 with light averaged" in why
 
 
+@pytest.mark.parametrize(("until", "first"), [(0.25, 0.3), (0.4, 0.5), (0.5, None)])
+def test_nothing_is_asked_while_images_are_coarse(
+    script: Script, until: float, first: float | None
+) -> None:
+    script.lost = lambda config, step, now: 0.0
+    config, decisions = begun(**{"pyramid.levels": 3, "pyramid.until": until})
+    kept = [d for d in decisions if not d.setting.startswith("pyramid")]
+    trainer = shaped(config, kept)
+    changed = [step / 10000 for step, _ in trainer.history[1:]]
+    assert changed[:1] == ([] if first is None else [first])
+
+
 @pytest.mark.parametrize(("less", "needed"), [(-0.01, False), (0.01, True)])
 def test_directions_go_where_light_is_even(script: Script, less: float, needed: bool) -> None:
-    script.even, script.lost = MOST_LOST + less, lambda config, step: 0.0
+    script.even, script.lost = MOST_LOST + less, lambda config, step, now: 0.0
     config, decisions = begun()
     assert shaped(config, decisions).config.network.view_dependent == needed
 
@@ -161,9 +173,10 @@ def test_directions_go_where_light_is_even(script: Script, less: float, needed: 
 def test_a_large_change_is_not_made_even_if_light_is_even(script: Script, mean: float) -> None:
     """What the mean of directions costs at once does not count against smaller tables."""
 
-    def lost(config: TrainConfig, step: int) -> float:
+    def lost(config: TrainConfig, step: int, now: TrainConfig) -> float:
         early = 0.8 if step < ASKED[-1] * 10000 else 0.0
-        return mean * (not config.network.view_dependent) + early + 0.25 * (16 - entries(config))
+        fewer = entries(now) - entries(config)
+        return mean * (not config.network.view_dependent) + early + 0.25 * fewer
 
     script.even, script.lost = 0.0, lost
     config, decisions = begun()
@@ -174,7 +187,7 @@ def test_a_large_change_is_not_made_even_if_light_is_even(script: Script, mean: 
 
 @pytest.mark.parametrize("enough", [10, 12, 15, 16])
 def test_tables_are_halved_as_far_as_that_loses_little(script: Script, enough: int) -> None:
-    script.lost = lambda config, step: 0.9 * AT_ONCE if entries(config) >= enough else 3.0
+    script.lost = lambda config, step, now: 0.9 * AT_ONCE if entries(config) >= enough else 3.0
     config, decisions = begun()
     trainer = shaped(config, decisions)
     assert entries(trainer.config) == enough
@@ -184,7 +197,7 @@ def test_tables_are_halved_as_far_as_that_loses_little(script: Script, enough: i
 def test_octaves_of_fourier_features(script: Script) -> None:
     """L where two octaves more bring nothing; without a hash grid alone."""
 
-    def lost(config: TrainConfig, step: int) -> float:
+    def lost(config: TrainConfig, step: int, now: TrainConfig) -> float:
         assert config.position is not None
         return 0.0 if config.position.frequencies >= 8 else 0.3
 
@@ -204,7 +217,7 @@ def test_octaves_of_fourier_features(script: Script) -> None:
 
 @pytest.mark.parametrize("steps", [300, 350, 700, 20000])
 def test_all_views_are_learnt_from_in_time(script: Script, steps: int) -> None:
-    script.lost = lambda config, step: 0.0
+    script.lost = lambda config, step, now: 0.0
     config, decisions = begun()
     trainer = shaped(config, decisions, steps=steps, until=0.9)
     assert script.holds[-1][0] <= SETTLED * steps + 1 and not script.holds[-1][1]
@@ -246,7 +259,7 @@ def test_as_few_strata_as_the_field_needs(
 
 def test_after_a_collapse_it_asks_when_there_is_something_to_ask(script: Script) -> None:
     """The first questions again, if they were not answered before."""
-    script.lost = lambda config, step: 0.0
+    script.lost = lambda config, step, now: 0.0
     config, decisions = begun()
     trainer = FakeTrainer(config)
     policy = Shaping(trainer, None, decisions, lambda: trainer.step_count / 10000)
