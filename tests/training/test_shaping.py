@@ -56,7 +56,8 @@ class Script:
     """What views held back say of a model."""
 
     even: float = 1.0  # lost with light averaged over directions
-    lost: Callable[[TrainConfig, int, TrainConfig], float] = lambda config, step, now: 2.0  # in the shape of
+    # in the shape of a configuration, at a step, from the present one
+    lost: Callable[[TrainConfig, int, TrainConfig], float] = lambda config, step, now: 2.0
     strata: dict[int, float] = field(default_factory=lambda: {64: 29.0, 96: 29.5})
     holds: list[tuple[int, bool]] = field(default_factory=list)
 
