@@ -127,8 +127,8 @@ def start(
     Args:
         data: folder of a dataset.
         out: folder of the run; created.
-        preset: ``nerf``, ``fast``, ``paper``, or ``auto``, which now begins to train
-            several models.
+        preset: ``nerf``, ``fast``, ``paper``, or ``auto``, which takes shape while it
+            trains.
         max_seconds, steps: the budget, wall-clock seconds of training or steps, which the
             learning rate follows. If neither is given: 600 seconds; with ``paper`` its
             200,000 steps, if they take less than a day. ``run.forecast`` says what they would.

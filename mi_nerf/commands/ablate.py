@@ -26,6 +26,8 @@ class Ablate:
     mi-nerf ablate lego/ --out ablation/ --downscale 2 --max-seconds 300 --seeds 3
 
     mi-nerf ablate lego/ --out quick/ --rows no-pe no-vd complete --downscale 4 --steps 2000
+
+    mi-nerf ablate lego/ --out octaves/ --rows L=4 L=6 L=8 L=10 L=12 --max-seconds 120
     """
 
     data: Positional[Annotated[Path, arg(metavar="DATA")]]
@@ -33,7 +35,7 @@ class Ablate:
     out: Path
     """Folder of the runs, the table (ablation.md, ablation.json) and the figure."""
     rows: tuple[str, ...] = tuple(ROWS)
-    """Which rows of the table."""
+    """Which rows of the table; L=N for N octaves of the position."""
     seeds: int = 1
     """Runs of each row, with seeds from 0."""
     preset: str = "nerf"

@@ -68,12 +68,15 @@ class Train:
             variant=choose_variant(self.variant),
             started=started,
         )
-        for decision in run.decisions:
-            print(f"auto: {decision}")
+        said = [str(decision) for decision in run.decisions]
+        print("".join(f"auto: {line}\n" for line in said), end="")
         print(f"model: {run.sizes}")
         if run.forecast is not None:
             print(f"{self.preset}: {run.forecast.sentence()}", flush=True)
         run.train()
+        for line in map(str, run.decisions):  # what has become clear on the way
+            if line not in said:
+                print(f"auto: {line}")
         trainer = run.trainer
         hint = "" if run.progress >= 1 else "; stopped early, go on with --resume"
         print(f"{self.out}: {trainer.step_count} steps in {run.seconds:.0f} s{hint}")

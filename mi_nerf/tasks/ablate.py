@@ -91,6 +91,10 @@ ROWS = {
     "complete": Row("Complete model", lambda c: c),
 }
 
+# Besides the paper's table: the choice of L, which its critics found to depend on the scene.
+OCTAVES = {f"L={n}": Row(f"L = {n}", _octaves(n)) for n in range(1, 17)}
+_ALL = ROWS | OCTAVES
+
 
 def ablate(
     data: str | Path,
@@ -116,8 +120,9 @@ def ablate(
         InputError: if a row is unknown, or the folder holds another ablation.
     """
     for name in rows:
-        if name not in ROWS:
-            raise InputError(f"row '{name}': unknown, expected one of {', '.join(ROWS)}")
+        if name not in _ALL:
+            known = f"{', '.join(ROWS)}, or L=1 to L={len(OCTAVES)}"
+            raise InputError(f"row '{name}': unknown, expected one of {known}")
     if config.preset == "auto":
         raise InputError("preset 'auto': decides what rows differ in, expected nerf, fast or paper")
     folder = Path(out)
@@ -131,7 +136,7 @@ def ablate(
         measure = partial(_quality, settings=settings, variant=variant)
         return trained(data, folder / name / f"seed_{config.seed}", config, variant, measure)
 
-    configs = {name: ROWS[name].change(base) for name in rows}
+    configs = {name: _ALL[name].change(base) for name in rows}
     all_trained(record, configs, seeds, train, _summary, folder / RECORD, "an ablation")
     write_text(folder / TABLE, table(record).splitlines())
     if any(row["psnr"] is not None for row in record["rows"]):
@@ -155,7 +160,7 @@ def _summary(name: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
     keys = ("psnr", "ssim", "train_seconds", "queries_per_ray", "parameters")
     means = {key: mean(run[key] for run in good) for key in keys}
     counts = {"seeds": len(runs), "failures": len(runs) - len(good)}
-    return {"name": name, "title": ROWS[name].title, **means, **counts, "runs": runs}
+    return {"name": name, "title": _ALL[name].title, **means, **counts, "runs": runs}
 
 
 def table(record: dict[str, Any]) -> str:

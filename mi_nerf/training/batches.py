@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,12 +96,19 @@ class RaySource:
         self._poses = float_type(pack_poses(dataset.cam_to_world))
         self._background = background
         self._views = len(dataset)
+        self._chosen: Any = None  # numbers of the views to draw from; none: all
         self._pyramid = pyramid or PyramidConfig()
 
     @property
     def nbytes(self) -> int:
         """Memory that the pixels take."""
         return self._pixels.nbytes
+
+    def of_views(self, views: Sequence[int]) -> RaySource:
+        """A source of some of the views; it shares the pixels."""
+        some = copy.copy(self)
+        some._views, some._chosen = len(views), self._uint(list(views))
+        return some
 
     def draw(self, rays: int, rng: Any, crop: float = 1.0, level: float = 0.0) -> RayBatch:
         """``rays`` pixels chosen uniformly over all images, through their centres.
@@ -123,8 +132,8 @@ class RaySource:
         columns, rows, left, top = _window(full, crop)
         width, area = dr.opaque(uint, columns), dr.opaque(uint, columns * rows)
         chosen = rng.integers(uint, rays, high=dr.opaque(uint, self._views * columns * rows))
-        camera = chosen // area
-        within = chosen - camera * area
+        number = chosen // area
+        within, camera = chosen - number * area, self._camera(number)
         row = within // width
         column = within - row * width + dr.opaque(uint, left)
         row = row + dr.opaque(uint, top)
@@ -142,8 +151,8 @@ class RaySource:
         area = width * height
         dr.eval(area, octave)
         chosen = rng.integers(uint, rays, high=area * dr.opaque(uint, self._views))
-        camera = chosen // area
-        within = chosen - camera * area
+        number = chosen // area
+        within, camera = chosen - number * area, self._camera(number)
         row = within // width
         column = (within - row * width) * side + dr.opaque(uint, left)
         row = row * side + dr.opaque(uint, top)
@@ -154,6 +163,10 @@ class RaySource:
             reach = dr.select(octave > 0, extent, 0)
             x, y = (n + (rng.random(self._float, rays) - 0.5) * reach for n in (x, y))
         return _Pixel(camera, x, y, self._pixels.mean(first, side))
+
+    def _camera(self, number: Any) -> Any:
+        """The view that is so many among those to draw from."""
+        return number if self._chosen is None else dr.gather(self._uint, self._chosen, number)
 
     def _draw_levels(self, rays: int, rng: Any, level: float) -> Any:
         """The level of each ray: one of the two beside ``level``, or any for a mixed share."""

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +27,26 @@ from ..data import Dataset, load_dataset
 from ..formats.field_file import FieldFile, save_field
 from ..march.marched import MarchedField
 from ..march.view import View, display_image, render_view
-from .auto import Choice, Decision, choose
-from .checkpoint import Progress, load_checkpoint, save_checkpoint
-from .config import TrainConfig, to_json
+from .auto import Choice, Decision, choose, decisions_in
+from .checkpoint import Progress, load_checkpoint, read_checkpoint, save_checkpoint
+from .config import TrainConfig, from_json, to_json
 from .device import for_device
 from .forecast import PUBLISHED_STEPS, Forecast, forecast
 from .fresh import field_file, render_settings
 from .progress import Meter, ProgressBar
-from .run_folder import CHECKPOINT, CONFIG, FIELD, FORMAT, LOG, cut_log, read_config
+from .run_folder import (
+    CHECKPOINT,
+    CONFIG,
+    FIELD,
+    FORMAT,
+    LOG,
+    cut_log,
+    read_config,
+    read_record,
+)
 from .scaling import summary
 from .schedule import learning_rate
+from .shaping import Shaping
 from .trainer import StepResult, Trainer
 
 
@@ -61,7 +71,7 @@ class Run:
         Args:
             started: the value of ``time.monotonic()`` from which seconds count; none: they
                 count while :meth:`reports` is at work.
-            trainer: of this configuration and dataset, to go on with if it has begun.
+            trainer: of this configuration and dataset, in place of a new one.
         """
         self.folder, self.variant = folder, variant
         self.decisions: list[Decision] = []  # why the configuration is what it is
@@ -71,12 +81,14 @@ class Run:
         self._paused = time.monotonic()  # since then
         self.trainer = trainer or Trainer(config, dataset, array_module(variant))
         self.config = self.trainer.config  # with what follows from the data
+        self._shaping: Shaping | None = None
+        self._record: dict[str, Any] = {}  # what config.json holds
         self._blank = self.trainer.blank_loss
         self._before = 0.0  # seconds of training before the clock was last started
         self._skipped = 0
         self._skipped_in_row = self._without_rays = 0
         self._attempt_start = 0
-        self._begun = self.trainer.step_count  # before the log began
+        self._begun = 0  # steps before the log began
         self._since = Meter()
         # Squared errors of the last steps, as many as tell a collapse from bad luck.
         self._recent: deque[float] = deque(maxlen=max(1, min(100, config.collapse_check // 2)))
@@ -103,6 +115,16 @@ class Run:
         """What is trained, in a line: features, cells, strata, and how much memory they take."""
         trainer = self.trainer
         return summary(self.config, trainer.field_config, trainer.image_bytes)
+
+    def shape(self, dataset: Dataset, decisions: list[Decision]) -> None:
+        """Lets the model take shape while it trains; ``decisions`` say why it is what it is."""
+        self.decisions = decisions
+        self._shaping = Shaping(self.trainer, dataset, decisions, lambda: self.progress)
+
+    def keep_record(self, record: dict[str, Any]) -> None:
+        """Writes ``config.json``, now and whenever the run is saved in another shape."""
+        self._record = record
+        write_json(self.folder / CONFIG, record)
 
     def resume(self) -> None:
         """Goes back to the checkpoint of the folder, and cuts the log to match."""
@@ -157,6 +179,8 @@ class Run:
                 self._advance()
                 if self._collapsed():
                     self._restart()
+                if self._shaping is not None and self._shaping.after_step():
+                    self._note_shape()
                 now = self.seconds
                 self.interrupted = bool(stop)
                 finished = self.progress >= 1 or self.interrupted
@@ -204,6 +228,9 @@ class Run:
         progress = Progress(self.seconds, self._skipped, self._attempt_start, self._begun)
         save_checkpoint(self.folder / CHECKPOINT, self.trainer, progress)
         save_field(self.folder / FIELD, self.field_file())
+        if self._shaping is not None and self._record:
+            # Last: a checkpoint in another shape counts, see _resumed_config.
+            self.keep_record(self._present_record())
 
     def field_file(self) -> FieldFile:
         """The field as it is now, as XML scenes will load it."""
@@ -280,6 +307,28 @@ class Run:
                 f"{self.trainer.step_count}; try a larger sampling.batch or fewer sampling.rays"
             )
 
+    # ----------------------------------- Shape -----------------------------------
+
+    def _note_shape(self) -> None:
+        """Goes on with the configuration that the trainer has by now."""
+        config, budget = self.trainer.config, self.config
+        self.config = replace(config, steps=budget.steps, max_seconds=budget.max_seconds)
+        self._blank = self.trainer.blank_loss
+
+    def _present_record(self) -> dict[str, Any]:
+        """What ``config.json`` holds by now; its budget stays what the run began with."""
+        budget = {n: self._record["settings"].get(n) for n in ("steps", "max_seconds")}
+        field = {
+            **self._record["field"],
+            "parameters": self.trainer.field_config.parameter_count(),
+        }
+        return {
+            **self._record,
+            "settings": {**to_json(self.config), **budget},
+            "field": field,
+            "auto": [decision.as_json() for decision in self.decisions],
+        }
+
     # ---------------------------------- Collapse ----------------------------------
 
     def _collapsed(self) -> bool:
@@ -340,10 +389,10 @@ def start(
 
     With ``resume`` the folder's own configuration holds; only ``steps`` and
     ``max_seconds`` of ``config`` take its place, where given. Seconds count from ``started``,
-    or else while this function and :meth:`Run.reports` are at work. A new run with preset
-    ``auto`` first chooses its model, within its time but besides its steps; settings
-    named in ``given`` or unlike the preset's are kept. One with a preset that has a published
-    schedule first measures how long that takes, and follows it if it has no budget.
+    or else while this function and :meth:`Run.reports` are at work. A run with preset
+    ``auto`` chooses its model, in part while it trains; settings named in ``given`` or unlike
+    the preset's are kept. A new one with a preset that has a published schedule first measures
+    how long that takes, and follows it if it has no budget.
 
     Raises:
         InputError: if the folder already holds a run, the data cannot be read, or a published
@@ -369,16 +418,25 @@ def start(
         if config.steps is None and config.max_seconds is None:
             config = replace(config, steps=PUBLISHED_STEPS[config.preset])
     choice = Choice(config, [])
-    if config.preset == "auto" and not recorded:
-        choice = choose(config, dataset, array_module(variant), given=given)
-    run = Run(folder, choice.config, dataset, variant, started=clock, trainer=choice.trainer)
-    run.decisions, run.forecast = choice.decisions, expected
+    if config.preset == "auto":
+        choice = (
+            Choice(config, decisions_in(read_record(folder), config))
+            if recorded
+            else choose(config, dataset, given=given)
+        )
+    run = Run(folder, choice.config, dataset, variant, started=clock)
+    run.forecast = expected
     make_folder(folder)
     if resume and (folder / CHECKPOINT).exists():
         run.resume()
     else:
         (folder / LOG).unlink(missing_ok=True)
-        write_json(folder / CONFIG, _record(run, dataset))
+    if choice.decisions:
+        run.shape(dataset, choice.decisions)
+    if recorded:
+        run.keep_record(read_record(folder))
+    else:
+        run.keep_record(_record(run, dataset))
     if started is None:
         run.pause()
     return run
@@ -389,6 +447,12 @@ def _resumed_config(folder: Path, given: TrainConfig, data: str | Path) -> Train
     recorded = record["data"]["path"]
     if Path(recorded) != Path(data).resolve():
         raise InputError(f"{data}: expected {recorded}, on which the run in {folder} was trained")
+    if config.preset == "auto" and (folder / CHECKPOINT).exists():
+        # It may have another shape than when config.json was last written.
+        _, description = read_checkpoint(folder / CHECKPOINT)
+        if description.settings is not None:
+            shaped = from_json(description.settings, str(folder / CHECKPOINT))
+            config = replace(shaped, steps=config.steps, max_seconds=config.max_seconds)
     if given.steps is not None or given.max_seconds is not None:
         config = replace(config, steps=given.steps, max_seconds=given.max_seconds)
     return config
@@ -415,7 +479,7 @@ def _record(run: Run, dataset: Dataset) -> dict[str, Any]:
             "upper": field.upper,
             "parameters": field.parameter_count(),
         },
-        **({"auto": [asdict(d) for d in run.decisions]} if run.decisions else {}),
+        **({"auto": [d.as_json() for d in run.decisions]} if run.decisions else {}),
         "variant": run.variant,
         "versions": {
             "mi_nerf": __version__,

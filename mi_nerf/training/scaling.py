@@ -4,7 +4,8 @@ Settings that are ``None`` are found here. The measure is the number of pixels t
 longest side of the box spans in a typical view: up to :data:`USUAL` of them, presets were
 measured and keep their sizes; from there on these grow with x, the octaves beyond:
 
-- vertices near a surface are as many as pixels see it: a table of 4^x as many entries;
+- a table of 2^x as many entries: pixels see 4^x as many vertices near a surface, but more entries
+  cost a step more than they bring within minutes;
 - a ray through twice as many cells needs more strata, but fewer of them are evaluated:
   2^(0.6 x) as many, and as many cells along the box;
 - a refresh of the occupancy looks at as many cells more as there are cells along the box.
@@ -57,7 +58,7 @@ def sizes(pixels: float, features: bool) -> Sizes:
     more = 2 ** (_EXPONENT * octaves)
     cells = _sixteens((64 if features else 96) * more)
     return Sizes(
-        log2_entries=min(_LARGEST, 16 + math.ceil(2 * octaves - 0.5)),
+        log2_entries=min(_LARGEST, 16 + math.floor(octaves)),
         cells=cells,
         queries=(8192 if features else 16384) * cells // (64 if features else 96),
         samples=_sixteens(64 * more),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 from ..base.errors import InputError
 from ..base.kernel_stages import stage
 from ..base.machine import available_memory
+from ..base.tensor_file import prefixed
 from ..data import Dataset
 from ..fields.neural import NeuralField
 from ..fields.protocol import Field
@@ -26,6 +27,7 @@ from ..march.samples import Samples, rays_with_samples
 from ..march.settings import MarchSettings
 from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
+from .growth import Reshaping, Snapshot, field_in_shape, reshaped
 from .loss_scale import LossScale
 from .losses import LOSSES, mean_squared_error, squared_error
 from .model import carved_cells, field_config
@@ -128,26 +130,30 @@ class Trainer:
         self.field_config = field_config(config, dataset)
         self._hull = carved_cells(config, dataset, self.field_config) if cells is None else cells
         _require_memory(config)
+        self.background = config.background
+        if self.background == "auto":
+            self.background = "random" if dataset.has_alpha else "white"
+        self._noise_level = 0.0 if dataset.has_alpha else config.density.noise
+        self._images = RaySource(dataset, self.background, backend.Float, config.pyramid)
+        self.blank_loss = blank_loss(dataset, self.background, config.pyramid.levels or 0)
+        self.learn_from()
         loss = config.loss
         if loss == "auto":
             loss = "mse" if dataset.color_space == "srgb" else "relative"
         self._loss = LOSSES[loss]
-        self.learn_from(dataset)
+        self._over_all_backgrounds = self.background == "random" and self._loss is squared_error
         self.step_count = 0
         self.attempt = 0  # restarts after a collapse so far
         self.rays_per_step = 0.0
         self.reset()
 
-    def learn_from(self, dataset: Dataset) -> None:
-        """Takes the rays of further steps from ``dataset``, a scene in the same box."""
-        background = self.config.background
-        if background == "auto":
-            background = "random" if dataset.has_alpha else "white"
-        self._over_all_backgrounds = background == "random" and self._loss is squared_error
-        self._noise_level = 0.0 if dataset.has_alpha else self.config.density.noise
-        self.background = background
-        self._source = RaySource(dataset, background, self._backend.Float, self.config.pyramid)
-        self.blank_loss = blank_loss(dataset, background, self.config.pyramid.levels or 0)
+    def learn_from(self, views: Sequence[int] | None = None) -> None:
+        """Takes the rays of further steps from these views of the dataset alone; none: all."""
+        self._source = self._images if views is None else self._images.of_views(views)
+
+    def pixels_of(self, views: Sequence[int], count: int, seed: int) -> RayBatch:
+        """Random pixels of some views, those of the images themselves."""
+        return self._images.of_views(views).draw(count, step_rng(self._backend.Float, seed, 0))
 
     def reset(self) -> None:
         """Fresh weights, moments and occupancy, from the seed and the attempt."""
@@ -156,19 +162,7 @@ class Trainer:
         tensors, coarse = self._backend.TensorXf, None
         if config.sampling.fine:
             coarse = NeuralField.create(self.field_config, seed + _COARSE_SEED, tensors)
-        self.field = NeuralField.create(self.field_config, seed, tensors, coarse)
-        groups = {"": self.field.parameters()}
-        if coarse is not None:
-            groups["coarse."] = coarse.parameters()
-        self.parameters = JointParameters(groups)
-        options = config.optimizer
-        self.optimizer = Adam(
-            self.parameters,
-            beta1=options.beta1,
-            beta2=options.beta2,
-            epsilon=options.epsilon,
-            muon=options.muon,
-        )
+        self._optimize(NeuralField.create(self.field_config, seed, tensors, coarse))
         self.loss_scale = LossScale(self._backend.Float) if config.half_precision else None
         self.occupancy = None
         if config.occupancy.enabled:
@@ -180,10 +174,96 @@ class Trainer:
             sampling.rays or min(sampling.max_rays, max(1, sampling.batch // sampling.samples))
         )
 
+    def _optimize(self, field: NeuralField) -> None:
+        """Begins to optimise the parameters of a field."""
+        self.field = field
+        groups = {"": field.parameters()}
+        if field.coarse is not None:
+            groups["coarse."] = field.coarse.parameters()
+        self.parameters = JointParameters(groups)
+        options = self.config.optimizer
+        self.optimizer = Adam(
+            self.parameters,
+            beta1=options.beta1,
+            beta2=options.beta2,
+            epsilon=options.epsilon,
+            muon=options.muon,
+        )
+
+    def become(self, config: TrainConfig) -> None:
+        """Goes on with another configuration, from the present parameters and moments.
+
+        A larger model is the same function at first; see :mod:`mi_nerf.training.growth`.
+        Data, box, loss and precision stay as they are.
+
+        Raises:
+            ValueError: if layers would have to go, or could not start as the identity.
+        """
+        self.go_on_from(self.in_shape_of(config))
+
+    def in_shape_of(self, config: TrainConfig) -> Snapshot:
+        """The model that :meth:`become` would go on with; changes nothing."""
+        return reshaped(self.snapshot(), config, self._shape_seed(), self._left(config))
+
+    def field_in_shape_of(self, config: TrainConfig) -> NeuralField:
+        """The field alone that :meth:`become` would go on with; changes nothing."""
+        model = self.snapshot()
+        field = field_in_shape(model.field, config)
+        weights = Reshaping(model.field, field).weights(
+            {n: w for n, w in model.weights.items() if not n.startswith("coarse.")},
+            self._shape_seed(),
+            importance=prefixed(model.optimizer, "second."),
+            direction=self._left(config),
+        )
+        return NeuralField(field, weights, self._backend.TensorXf, self.field.coarse)
+
+    def _shape_seed(self) -> int:
+        return self.config.seed + 1000 * self.attempt + self.step_count
+
+    def _left(self, config: TrainConfig) -> np.ndarray[Any, Any] | None:
+        """What a field that is to see no directions any more sees in their place."""
+        loses = self.config.network.view_dependent and not config.network.view_dependent
+        return self._mean_direction() if loses else None
+
+    def snapshot(self) -> Snapshot:
+        """The model as it is now, for :meth:`go_on_from`."""
+        return Snapshot(
+            self.config,
+            self.field_config,
+            {name: np.array(tensor) for name, tensor in self.parameters.items()},
+            self.optimizer.state(),
+            self._hull,
+            {} if self.occupancy is None else self.occupancy.state(),
+            self.rays_per_step,
+        )
+
+    def go_on_from(self, model: Snapshot) -> None:
+        """Takes up a model; the number of the step stays."""
+        self.config, self.field_config, self._hull = model.config, model.field, model.cells
+        tensors, coarse = self._backend.TensorXf, None
+        if model.config.sampling.fine:
+            coarse = NeuralField(model.field, prefixed(model.weights, "coarse."), tensors)
+        own = {n: a for n, a in model.weights.items() if not n.startswith("coarse.")}
+        self._optimize(NeuralField(model.field, own, tensors, coarse))
+        self.optimizer.restore(model.optimizer)
+        if self.occupancy is not None:
+            self.occupancy = OccupancyGrid(
+                self.field.lower, self.field.upper, model.cells, self._backend.Float
+            )
+            self.occupancy.restore(model.occupancy)
+        self.rays_per_step = model.rays
+
+    def _mean_direction(self) -> np.ndarray[Any, Any]:
+        """Features of directions, their mean over rays of the images."""
+        batch = self._source.draw(4096, step_rng(self._backend.Float, self.config.seed, 0))
+        with dr.suspend_grad():
+            features = self.field_config.direction.features(batch.d)
+            return np.array([float(dr.mean(f)[0]) for f in features], np.float32)
+
     @property
     def image_bytes(self) -> int:
         """Memory that the pixels take on the device."""
-        return self._source.nbytes
+        return self._images.nbytes
 
     def march_settings(self) -> MarchSettings:
         """How rays are sampled in training."""
@@ -210,9 +290,16 @@ class Trainer:
         self._adapt_rays(drawn.rays, found.wanted)
         return StepResult(found.loss, found.mse, accepted, found.rays, found.queries)
 
-    def validate(self, batch: RayBatch, field: Field | None = None) -> float:
-        """The loss over the pixels of ``batch``, by this field or another; changes nothing."""
+    def validate(
+        self, batch: RayBatch, field: Field | None = None, *, samples: int | None = None
+    ) -> float:
+        """The loss over the pixels of ``batch``, by this field or another; changes nothing.
+
+        Args:
+            samples: strata a ray; none: as in training.
+        """
         march = replace(self.march_settings(), hidden=0.0, fine=self.config.sampling.fine)
+        march = replace(march, samples=samples or march.samples)
         with dr.suspend_grad():
             seen = render_rays(
                 MarchedField(field or self.field, march, self.occupancy), batch.o, batch.d

@@ -51,6 +51,8 @@ PLAN = (
     Task(19, "tests.benchmarks.quality --preset fast --seconds 300 --downscale 1"),
     Task(9, "tests.benchmarks.quality --preset nerf --seconds 120"),
     Task(33, "tests.benchmarks.quality --preset nerf --seconds 600"),
+    Task(20, "tests.benchmarks.shape"),
+    Task(20, "tests.benchmarks.octaves", timed=False),
     Task(4, "tests.benchmarks.startup", compares=True),
     Task(12, "tests.benchmarks.frames", compares=True),
     Task(3, "tests.benchmarks.rendering --preset fast --seconds 60"),

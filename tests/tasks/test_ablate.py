@@ -13,7 +13,7 @@ import pytest
 
 from mi_nerf.cli import main
 from mi_nerf.tasks import ablate as ablation
-from mi_nerf.tasks.ablate import ROWS, ablate, complete, table
+from mi_nerf.tasks.ablate import OCTAVES, ROWS, ablate, complete, table
 from mi_nerf.training import run as training
 from mi_nerf.training.config import TrainConfig, with_settings
 from mi_nerf.training.presets import preset
@@ -29,6 +29,14 @@ def tiny(**changes: int) -> TrainConfig:
 
 def row(name: str) -> TrainConfig:
     return ROWS[name].change(complete(preset("paper")))
+
+
+def test_rows_of_octaves_differ_in_octaves_alone() -> None:
+    whole = complete(preset("nerf"))
+    for count in (1, 4, 10, 16):
+        found = OCTAVES[f"L={count}"].change(whole)
+        assert found.position.frequencies == count
+        assert replace(found, position=whole.position) == whole
 
 
 def test_rows_are_those_of_the_paper() -> None:

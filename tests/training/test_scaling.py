@@ -73,7 +73,7 @@ def test_small_images_have_the_sizes_of_before(name: str, pixels: float) -> None
 
 
 def test_full_size_lego() -> None:
-    expected = Sizes(log2_entries=19, cells=128, queries=16384, samples=128, render_samples=256)
+    expected = Sizes(log2_entries=17, cells=128, queries=16384, samples=128, render_samples=256)
     assert sizes(677, features=True) == expected
 
 
@@ -84,9 +84,9 @@ def test_sizes_grow_with_the_resolution(one: float, other: float, features: bool
     assert large["log2_entries"] <= 22 and large["samples"] % 16 == 0
 
 
-def test_four_times_the_entries_for_twice_the_pixels() -> None:
+def test_twice_the_entries_for_twice_the_pixels() -> None:
     entries = [sizes(220 * 2**octave, features=True).log2_entries for octave in range(4)]
-    assert entries == [16, 18, 20, 22]
+    assert entries == [16, 17, 18, 19]
 
 
 @pytest.mark.parametrize("name", ["nerf", "fast"])
@@ -154,5 +154,5 @@ def test_the_summary_says_what_was_found() -> None:
     dataset = views(800)
     config = resolved(preset("fast"), dataset)
     text = summary(config, field_config(config, dataset), 4 * 2 * 800 * 800)
-    assert "2^19 entries" in text and "strata" in text and "images of 5 MiB" in text
+    assert "2^17 entries" in text and "strata" in text and "images of 5 MiB" in text
     assert "images from 1/8 size on" in text
