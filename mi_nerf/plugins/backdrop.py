@@ -29,6 +29,9 @@ _REPLAYED = {  # Python, differentiated by following the same paths once more
 }
 
 
+_OF_MEDIA = ("VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator")
+
+
 @dataclass(frozen=True)
 class Hit:
     """Where camera rays end: at the first surface, or nowhere."""
@@ -133,12 +136,12 @@ class Surfaces(Backdrop):
         dr.eval(hit.distance, hit.normal)
         return hit
 
-    def shade(self, hit: Hit, ray: Any, sampler: Any, opacity: Any) -> Light:
-        """What the nested integrator returns for the rays, on average."""
+    def shade(self, hit: Hit, ray: Any, sampler: Any, opacity: Any, active: Any = True) -> Light:
+        """What the nested integrator returns for the rays, on average; 0 if not active."""
         total, states, valid = mi.Color3f(0), [], mi.Bool(False)
         sampler = sampler.clone()
         for _ in range(self._paths):
-            radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler)
+            radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler, active)
             total += radiance
             states.append(state)
             sampler.schedule_state()
@@ -147,22 +150,24 @@ class Surfaces(Backdrop):
         dr.eval(light.radiance, light.valid)
         return light
 
-    def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
+    def backward(
+        self, ray: Any, sampler: Any, light: Light, gradients: list[Any], active: Any = True
+    ) -> None:
         if not self._differentiable():
             return
         pull = mi.Color3f(*gradients) * (1 / self._paths)
         sampler = sampler.clone()
         for state in light.states:
             if self._replayed:
-                self._sample(dr.ADMode.Backward, ray, sampler, pull, state)
+                self._sample(dr.ADMode.Backward, ray, sampler, active, pull, state)
             else:
                 with dr.resume_grad(), _differentiable_loops():
-                    radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler)
+                    radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler, active)
                     _backward(list(radiance), list(pull))
             sampler.schedule_state()
             dr.eval()
 
-    def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
+    def forward(self, ray: Any, sampler: Any, light: Light, active: Any = True) -> list[Any]:
         total = dr.zeros(mi.Color3f, dr.width(ray))
         if not self._differentiable():
             return list(total)
@@ -174,10 +179,10 @@ class Surfaces(Backdrop):
         sampler = sampler.clone()
         for state in light.states:
             if self._replayed:
-                total += self._sample(dr.ADMode.Forward, ray, sampler, None, state)[0]
+                total += self._sample(dr.ADMode.Forward, ray, sampler, active, None, state)[0]
             else:
                 with dr.resume_grad(), _differentiable_loops():
-                    radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler)
+                    radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler, active)
                     total += mi.Color3f(*_forward(list(radiance)))
             sampler.schedule_state()
             dr.eval(total)
@@ -189,12 +194,18 @@ class Surfaces(Backdrop):
             return bool(dr.grad_enabled([value for _, value in mi.traverse(self._scene)]))
 
     def _sample(
-        self, mode: dr.ADMode, ray: Any, sampler: Any, pull: Any = None, state: Any = None
+        self,
+        mode: dr.ADMode,
+        ray: Any,
+        sampler: Any,
+        active: Any,
+        pull: Any = None,
+        state: Any = None,
     ) -> tuple[Any, Any, Any]:
         """Radiance, validity and state of one path a ray."""
         scene = self._scene
         if not self._replayed:
-            radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, True)
+            radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, active)
             return radiance, valid, None
         radiance, valid, _, state = self._integrator.sample(
             mode=mode,
@@ -205,9 +216,14 @@ class Surfaces(Backdrop):
             δL=pull,
             δaovs=None,
             state_in=state,
-            active=mi.Bool(True),
+            active=mi.Bool(active),
         )
         return radiance, valid, state
+
+
+def knows_media(integrator: Any) -> bool:
+    """Whether a nested integrator shows media."""
+    return integrator is not None and _class_name(integrator) in _OF_MEDIA
 
 
 def check_nested(integrator: Any) -> None:

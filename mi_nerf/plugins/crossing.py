@@ -43,7 +43,7 @@ class Crossing:
         with dr.resume_grad(when=moving):
             o, d, self.scale = self._placed.to_local(rays.o, rays.d, moving=moving)
             dr.eval(o, d, self.scale)
-            bounds = marched.bounds(rays.reach, self.scale)
+            bounds = marched.bounds(rays.reach, self.scale, rays.start)
             self.samples = place_samples(
                 marched.marched,
                 dr.detach(o),

@@ -7,10 +7,12 @@ from typing import Any
 import mitsuba as mi
 
 from ..base.errors import InputError
-from .backdrop import Backdrop, Environment, Surfaces, check_nested
+from .backdrop import Backdrop, Environment, Surfaces, check_nested, knows_media
 from .field_scene import FieldScene
-from .film import FieldIntegrator
+from .film import FieldIntegrator, TracedScene
+from .fog_scene import FogScene
 from .marching import MarchingIntegrator
+from .media import media_of
 from .placement import find_fields
 from .solid_scene import SolidScene, has_surfaces
 
@@ -91,6 +93,13 @@ class NerfIntegrator(MarchingIntegrator):
     cubes, so fields cast no shadows and are missing in mirrors; :monosp:`nerf_path` has both. What
     is seen through a surface that is not opaque is likewise without fields.
 
+    Media of Mitsuba's own, homogeneous or heterogeneous, may stand beside the fields where
+    :monosp:`volpath`, :monosp:`volpathmis` or :monosp:`prbvolpath` is nested: what lies behind
+    them is weakened by them, what they scatter towards the camera by the fields before them
+    (:py:mod:`mi_nerf.plugins.fog_scene`). They are not lit or shaded by fields. They end where the
+    box of a field begins, in shapes with the BSDF :monosp:`null`. A ray that comes to a field
+    through fog asks the nested integrator twice, and a single sample may be negative there.
+
     The alpha channel of an RGBA film is the opacity of the fields; with a nested integrator,
     its alpha channel with the fields in front. The colour of a field trained on sRGB images is
     composited as in training and then decoded: with C the colour under the field's weights and
@@ -160,9 +169,9 @@ class NerfIntegrator(MarchingIntegrator):
             "]"
         )
 
-    def _scene(self, scene: mi.Scene) -> FieldScene:
+    def _scene(self, scene: mi.Scene) -> TracedScene:
         """The scene as it is now."""
-        found = find_fields(scene)
+        found = find_fields(scene, others=knows_media(self.nested))
         encoded = self.encoded and found[0].medium.field.color_space == "srgb"
         if self.encoded and (len(found) > 1 or self.nested is not None):
             raise InputError(
@@ -176,7 +185,10 @@ class NerfIntegrator(MarchingIntegrator):
             self._warn_of_surfaces(scene)
             backdrop = Environment(scene, self.show_background, encoded)
         else:
-            backdrop = Surfaces(self._solid.of(scene), self.nested, self.paths, normals)
+            solid = self._solid.of(scene)
+            backdrop = Surfaces(solid, self.nested, self.paths, normals)
+            if media_of(solid):
+                return FogScene(fields, solid, backdrop, normals)
         return FieldScene(fields, backdrop, normals)
 
     def _warn_of_surfaces(self, scene: mi.Scene) -> None:

@@ -41,7 +41,7 @@ class SampledField:
         """What rays see, see :func:`mi_nerf.march.walk.walk_rays`; and local per world length."""
         o, d, scale = self.placed.to_local(rays.o, rays.d)
         dr.eval(o, d, scale)
-        bounds = self.bounds(rays.reach, scale)
+        bounds = self.bounds(rays.reach, scale, rays.start)
         marched, jitter = self.marched, rays.jitter
         return walk_rays(marched, o, d, jitter=jitter, bounds=bounds, emission=emission), scale
 
@@ -49,20 +49,22 @@ class SampledField:
         """The same field for rays that do not come from a camera: near and far are its."""
         return replace(self, near=0.0, far=math.inf)
 
-    def bounds(self, reach: Any, scale: Any) -> tuple[Any, Any]:
-        """Bounds of t in field units: the integrator's or the file's, and ``reach``."""
+    def bounds(self, reach: Any, scale: Any, start: Any = None) -> tuple[Any, Any]:
+        """Bounds of t in field units: the integrator's or the file's, and those of the rays."""
         march = self.placed.medium.march
         near = mi.Float(march.near or 0) if self.near is None else self.near * scale
         far = mi.Float(dr.inf if march.far is None else march.far)
         if self.far is not None:
             far = self.far * scale
+        if start is not None:
+            near = dr.fmax(near, start * scale)
         return near, dr.fmin(far, reach * scale)
 
     def hit(self, rays: Rays) -> Any:
         """Which rays cross the box within their bounds."""
         o, d, scale = self.placed.to_local(rays.o, rays.d)
         dr.eval(o, d, scale)
-        return ray_segments(self.field, o, d, self.bounds(rays.reach, scale)).hit
+        return ray_segments(self.field, o, d, self.bounds(rays.reach, scale, rays.start)).hit
 
     @property
     def differentiable(self) -> bool:
@@ -80,11 +82,13 @@ class Rays:
     d: Any  # unit
     reach: Any  # R distances: of a surface, or of the far clip plane
     jitter: Any  # R numbers in [0, 1), or None
+    start: Any = None  # R distances from which on fields are to be seen, or None: from the origin
 
     def take(self, index: Any) -> Rays:
         """Some of them."""
         o, d = gather_vector3(self.o, index), gather_vector3(self.d, index)
         reach = dr.gather(mi.Float, self.reach, index)
         jitter = None if self.jitter is None else dr.gather(mi.Float, self.jitter, index)
-        dr.eval(o, d, reach, jitter)
-        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter)
+        start = None if self.start is None else dr.gather(mi.Float, self.start, index)
+        dr.eval(o, d, reach, jitter, start)
+        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter, start)
