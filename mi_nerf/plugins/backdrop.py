@@ -253,7 +253,7 @@ def _backward(values: list[Any], gradients: list[Any]) -> None:
         if dr.grad_enabled(value):
             dr.accum_grad(value, gradient)
             dr.enqueue(dr.ADMode.Backward, value)
-    dr.traverse(dr.ADMode.Backward)
+    dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)  # other passes take the same way
 
 
 def _forward(values: list[Any]) -> list[Any]:

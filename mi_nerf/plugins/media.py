@@ -171,7 +171,8 @@ class Passed:
                 if dr.grad_enabled(value):
                     dr.set_grad(value, gradient)
                     dr.enqueue(dr.ADMode.Backward, value)
-            dr.traverse(dr.ADMode.Backward)
+            # What leads from here to a grid of numbers is needed again.
+            dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)
 
     def forward(self) -> list[Any]:
         """The derivatives of the share along the gradients of the media."""

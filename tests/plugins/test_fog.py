@@ -34,13 +34,19 @@ BACK = 3.2  # where the lamp is
 def bank(
     y: float, depth: float, uneven: bool = False, albedo: float = 0.0, high: float = 6.0
 ) -> dict[str, Any]:
-    """Fog across the view from y to y + depth; an uneven one whose grid is constant."""
+    """Fog across the view from y to y + depth.
+
+    An uneven one has a grid that is constant as far as one sees, and denser in a corner: so
+    some of the collisions that Mitsuba samples are none.
+    """
     fill = place().translate([0, y + depth / 2, 0]).scale([6, depth / 2, high])
     medium: dict[str, Any] = {"type": "homogeneous", "sigma_t": rgb(EXTINCTION / 2)}
     if uneven:
         corner = fill.translate([-1, -1, -1]).scale(2)
-        grid = mi.VolumeGrid(np.tile(np.float32(EXTINCTION / 2), (3, 3, 3, 1)))
-        volume = {"type": "gridvolume", "grid": grid, "to_world": corner, "raw": True}
+        grid = np.tile(np.float32(EXTINCTION / 2), (7, 7, 7, 1))
+        grid[0, 0, 0] = 1.0
+        values = mi.VolumeGrid(grid)
+        volume = {"type": "gridvolume", "grid": values, "to_world": corner, "raw": True}
         medium = {"type": "heterogeneous", "sigma_t": volume}
     medium |= {"albedo": albedo, "scale": 2.0}
     return {"type": "cube", "to_world": fill, "bsdf": {"type": "null"}, "interior": medium}
@@ -85,7 +91,7 @@ DEPTH = 0.8
 def box_of(name: str) -> tuple[Any, float, Any]:
     """Place, density and radiance of a field."""
     if name == "here":
-        return place().scale([0.9, 0.5, 0.7]), 0.9, GLOW
+        return place().scale([0.9, 0.5, 0.7]), 0.9, (0.2, 0.7, 1.3)
     beyond = place().translate([0.2, 2.2, 0]).rotate([0, 1, 0], 30).scale([0.9, 0.5, 0.9])
     return beyond, 1.7, (0.1, 0.3, 1.1)
 
