@@ -40,6 +40,15 @@ class NerfIntegrator(MarchingIntegrator):
        - |int|
        - Strata along each ray between entry and exit of a field's box.
          (Default: what the field file suggests)
+     * - fine
+       - |int|
+       - More samples along each ray, where the field's coarse network sees something (hierarchical
+         sampling, NeRF Sec. 5.2); 0 switches it off. (Default: what the field file suggests)
+     * - network
+       - |string|
+       - Which one of a field with two networks is shown: ``fine``, whose samples the other one
+         places, or ``coarse`` itself, at ``samples`` places. A training loop renders both.
+         (Default: ``fine``)
      * - near, far
        - |float|
        - Fixed bounds of the distance along the ray, in world units, within the boxes.
@@ -136,6 +145,9 @@ class NerfIntegrator(MarchingIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.encoded = bool(props.get("encoded", False))
+        self.network = str(props.get("network", "fine"))
+        if self.network not in ("fine", "coarse"):
+            raise self._unlike("network", f"'{self.network}'", "fine or coarse")
         self.nested = self._find_nested(props)
         self._solid, self._warned = SolidScene(), False
 
@@ -164,7 +176,7 @@ class NerfIntegrator(MarchingIntegrator):
         return (
             "NerfIntegrator[\n"
             f"{self._settings()}"
-            f"  encoded = {self.encoded},\n"
+            f"  network = {self.network}, encoded = {self.encoded},\n"
             f"  nested = {self.nested}\n"
             "]"
         )
@@ -178,7 +190,7 @@ class NerfIntegrator(MarchingIntegrator):
                 "nerf: encoded=true with several fields or a nested integrator, expected a "
                 "single field: light mixes in linear radiance"
             )
-        fields = self._marched(found, encoded)
+        fields = self._marched(found, encoded, self.network == "coarse")
         normals = self._wants_normals(fields)
         backdrop: Backdrop
         if self.nested is None:

@@ -26,11 +26,13 @@ class SampledField:
     near: float | None  # along rays, world units; None: what the field file says
     far: float | None
     encoded: bool = False  # leave colours in the space in which they were composited
+    coarse: bool = False  # show the network that places the samples of the other one
 
     @property
     def field(self) -> Any:
         """The field."""
-        return self.placed.medium.field
+        field = self.placed.medium.field
+        return field.coarse if self.coarse else field
 
     @property
     def marched(self) -> MarchedField:
