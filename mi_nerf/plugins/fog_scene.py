@@ -63,16 +63,17 @@ class TracedInFog:
 
     def channels(self) -> Channels:
         """As :class:`Traced` has them; media count in color and alpha alone."""
-        light = self.parts[0].light
-        color, through = mi.Color3f(*light.radiance), mi.Float(1)
+        first = self.parts[0]
+        color, through = mi.UnpolarizedSpectrum(0), mi.Float(1)
         depth, normal = mi.Float(0), mi.Normal3f(0)
         most, index = mi.Float(0), mi.Float(0)
         for part in self.parts:
-            seen, passed = part.seen, mi.Color3f(1)
-            if part.passed is not None:
-                passed = mi.Color3f(*part.passed.share)
-            behind = mi.Color3f(*part.light.radiance)
-            color += passed * through * (seen.color - seen.opacity * behind)
+            seen, light = part.seen, mi.UnpolarizedSpectrum(*part.light.radiance)
+            if part.passed is None:
+                color += (1 - seen.opacity) * light
+            else:
+                passed = mi.UnpolarizedSpectrum(*part.passed.share)
+                color += passed * through * (seen.color - seen.opacity * light)
             share = through * seen.opacity
             depth += share * seen.values[4]
             normal += dr.detach(share) * seen.normal
@@ -82,10 +83,10 @@ class TracedInFog:
             through *= 1 - seen.opacity
         opacity = 1 - through
         inverse = dr.select(opacity > 0, 1 / dr.select(opacity > 0, opacity, 1), 0)
-        whole = Seen(
-            [*color, opacity, depth * inverse], normal * dr.detach(inverse), mi.Float(index)
-        )
-        return Traced(self.camera, self.hit, whole, light).channels() | {"color": color}
+        values = [*first.seen.values[:3], opacity, depth * inverse]
+        whole = Seen(values, normal * dr.detach(inverse), mi.Float(index))
+        channels = Traced(self.camera, self.hit, whole, first.light).channels()
+        return channels | {"color": first.seen.color + color}
 
 
 class FogScene:
@@ -185,4 +186,4 @@ class FogScene:
 def _rays(camera: CameraRays, gap: Gap) -> Rays:
     """The camera rays within a gap."""
     ray = camera.ray
-    return Rays(ray.o, ray.d, dr.fmin(gap.end, ray.maxt), camera.random, gap.start)
+    return Rays(ray.o, ray.d, dr.fmin(gap.end, ray.maxt), camera.random, start=gap.start)

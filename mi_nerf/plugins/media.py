@@ -153,7 +153,7 @@ class Passed:
         """
         self._fogs, self._ray, self._going = fogs, ray, going
         self._uneven = uneven
-        share = mi.Spectrum(1)
+        share = mi.UnpolarizedSpectrum(1)
         for fog in fogs:
             there = fog.there & going
             even = there & fog.medium.is_homogeneous() if uneven else there
@@ -187,7 +187,7 @@ class Passed:
         Its derivative is −T ∫ dσ: that of uneven media is asked for at random points, which
         were not those that led to T.
         """
-        depth = mi.Spectrum(0)
+        depth = mi.UnpolarizedSpectrum(0)
         for fog in self._fogs:
             there = fog.there & self._going
             depth += dr.select(there, self._depth(fog, there, self._points), 0)
@@ -196,10 +196,10 @@ class Passed:
     def _depth(self, fog: Fog, there: Any, points: list[Any]) -> Any:
         """The optical depth: exact of an even medium, else an estimate."""
         length = dr.select(there, fog.end - fog.start, 0)
-        total = mi.Spectrum(0)
+        total = mi.UnpolarizedSpectrum(0)
         for u in points:
             at = dr.zeros(mi.MediumInteraction3f, dr.width(length))
-            at.t = fog.start + u * length
+            at.t, at.wavelengths = fog.start + u * length, self._ray.wavelengths
             at.p = self._ray(at.t)
             _, _, extinction = fog.medium.get_scattering_coefficients(at, there)
             total += extinction * (length / len(points))
@@ -208,11 +208,12 @@ class Passed:
 
 def _tracked(fog: Fog, ray: Any, there: Any, random: Any) -> Any:
     """Transmittance by ratio tracking (Novák et al. 2014): a random number, right on average."""
-    total = mi.Spectrum(0)
+    total = mi.UnpolarizedSpectrum(0)
     for _ in range(_TRACKINGS):
         part = mi.Ray3f(ray)
         part.o, part.maxt = ray(fog.start), dr.select(there, fog.end - fog.start, 0)
-        share, going = mi.Spectrum(1) + dr.zeros(mi.Float, dr.width(there)), mi.Bool(there)
+        share = mi.UnpolarizedSpectrum(dr.full(mi.Float, 1, dr.width(there)))
+        going = mi.Bool(there)
 
         def body(part: Any, share: Any, going: Any, random: Any) -> Any:
             at = fog.medium.sample_interaction(part, random.next_float32(), 0, going)

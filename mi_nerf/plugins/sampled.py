@@ -93,4 +93,4 @@ class Rays:
         jitter = None if self.jitter is None else dr.gather(mi.Float, self.jitter, index)
         start = None if self.start is None else dr.gather(mi.Float, self.start, index)
         dr.eval(o, d, reach, jitter, start)
-        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter, start)
+        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter, start=start)
