@@ -29,6 +29,7 @@ Backwards, from a gradient of the image to parameters (``nerf``)::
           crossing.Moving.backward                to the pose of medium and cube
 
 ``nerf_path`` has another backdrop (paths.py), ``nerf_tracking`` another estimate of the integral.
+Where media of Mitsuba's own stand beside the fields, the scene is another one (fog_scene.py).
 
 Plugin classes inherit from classes of the active Mitsuba variant, so the modules that define them
 are imported once for each variant. Inside, light is RGB where fields emit it and in the colours of

@@ -30,6 +30,9 @@ _REPLAYED = {  # Python, differentiated by following the same paths once more
 }
 
 
+_OF_MEDIA = ("VolumetricPathIntegrator", "VolpathMisIntegratorImpl", "PRBVolpathIntegrator")
+
+
 @dataclass(frozen=True)
 class Hit:
     """Where camera rays end: at the first surface, or nowhere."""
@@ -134,12 +137,12 @@ class Surfaces(Backdrop):
         dr.eval(hit.distance, hit.normal)
         return hit
 
-    def shade(self, hit: Hit, ray: Any, sampler: Any, opacity: Any) -> Light:
-        """What the nested integrator returns for the rays, on average."""
+    def shade(self, hit: Hit, ray: Any, sampler: Any, opacity: Any, active: Any = True) -> Light:
+        """What the nested integrator returns for the rays, on average; 0 if not active."""
         total, states, valid = Spectrum(0), [], mi.Bool(False)
         sampler = sampler.clone()
         for _ in range(self._paths):
-            radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler)
+            radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler, active)
             total += radiance
             states.append(state)
             sampler.schedule_state()
@@ -148,22 +151,24 @@ class Surfaces(Backdrop):
         dr.eval(light.radiance, light.valid)
         return light
 
-    def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
+    def backward(
+        self, ray: Any, sampler: Any, light: Light, gradients: list[Any], active: Any = True
+    ) -> None:
         if not self._differentiable():
             return
         pull = Spectrum(*gradients) * (1 / self._paths)
         sampler = sampler.clone()
         for state in light.states:
             if self._replayed:
-                self._sample(dr.ADMode.Backward, ray, sampler, pull, state)
+                self._sample(dr.ADMode.Backward, ray, sampler, active, pull, state)
             else:
                 with dr.resume_grad(), _differentiable_loops():
-                    radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler)
+                    radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler, active)
                     _backward(list(radiance), list(pull))
             sampler.schedule_state()
             dr.eval()
 
-    def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
+    def forward(self, ray: Any, sampler: Any, light: Light, active: Any = True) -> list[Any]:
         total = dr.zeros(Spectrum, dr.width(ray))
         if not self._differentiable():
             return list(total)
@@ -175,10 +180,10 @@ class Surfaces(Backdrop):
         sampler = sampler.clone()
         for state in light.states:
             if self._replayed:
-                total += self._sample(dr.ADMode.Forward, ray, sampler, None, state)[0]
+                total += self._sample(dr.ADMode.Forward, ray, sampler, active, None, state)[0]
             else:
                 with dr.resume_grad(), _differentiable_loops():
-                    radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler)
+                    radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler, active)
                     total += Spectrum(*_forward(list(radiance)))
             sampler.schedule_state()
             dr.eval(total)
@@ -198,12 +203,18 @@ class Surfaces(Backdrop):
         return found
 
     def _sample(
-        self, mode: dr.ADMode, ray: Any, sampler: Any, pull: Any = None, state: Any = None
+        self,
+        mode: dr.ADMode,
+        ray: Any,
+        sampler: Any,
+        active: Any,
+        pull: Any = None,
+        state: Any = None,
     ) -> tuple[Any, Any, Any]:
         """Radiance, validity and state of one path a ray."""
         scene = self._scene
         if not self._replayed:
-            radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, True)
+            radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, active)
             return unpolarized(radiance), valid, None
         radiance, valid, _, state = self._integrator.sample(
             mode=mode,
@@ -214,9 +225,14 @@ class Surfaces(Backdrop):
             δL=None if pull is None else polarized(pull),
             δaovs=None,
             state_in=state,
-            active=mi.Bool(True),
+            active=mi.Bool(active),
         )
         return unpolarized(radiance), valid, state
+
+
+def knows_media(integrator: Any) -> bool:
+    """Whether a nested integrator shows media."""
+    return integrator is not None and _class_name(integrator) in _OF_MEDIA
 
 
 def check_nested(integrator: Any) -> None:
@@ -246,7 +262,7 @@ def _backward(values: list[Any], gradients: list[Any]) -> None:
         if dr.grad_enabled(value):
             dr.accum_grad(value, gradient)
             dr.enqueue(dr.ADMode.Backward, value)
-    dr.traverse(dr.ADMode.Backward)
+    dr.traverse(dr.ADMode.Backward, dr.ADFlag.ClearVertices)  # other passes take the same way
 
 
 def _forward(values: list[Any]) -> list[Any]:

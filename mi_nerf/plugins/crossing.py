@@ -47,7 +47,7 @@ class Crossing:
         with dr.resume_grad(when=moving):
             o, d, self.scale = self._placed.to_local(rays.o, rays.d, moving=moving)
             dr.eval(o, d, self.scale)
-            bounds = marched.bounds(rays.reach, self.scale)
+            bounds = marched.bounds(rays.reach, self.scale, rays.start)
             exact = mode != dr.ADMode.Primal or marched.trained
             whole = marched.differentiated if exact else marched.marched
             self.samples = place_samples(

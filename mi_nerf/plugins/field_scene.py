@@ -11,7 +11,7 @@ import mitsuba as mi
 from .backdrop import Backdrop, Hit, Light
 from .colors import Radiance, Spectrum
 from .film import CameraRays, Channels
-from .integral import Integral, Seen, chunks, few, scattered, see
+from .integral import Integral, Seen, chunks, few, pull_back, push_forward, scattered, see
 from .sampled import Rays, SampledField
 
 
@@ -97,26 +97,16 @@ class FieldScene:
         """Carries the gradients of ``outputs`` to the parameters of the scene."""
         camera, light = traced.camera, traced.light
         self._backdrop.backward(camera.ray, camera.sampler, light, gradients[5:])
-        if not self._differentiable():
+        if traced.kept is None:
+            pull_back(self._fields, _rays(camera, traced.hit), gradients[:5])
             return
-        if traced.kept is not None:
-            index, integral = traced.kept
-            integral.backward([dr.gather(mi.Float, g, index) for g in gradients[:5]])
-            return
-        for index, rays in chunks(self._fields, _rays(camera, traced.hit)):
-            integral = Integral(self._fields, rays, dr.ADMode.Backward)
-            integral.backward([dr.gather(mi.Float, g, index) for g in gradients[:5]])
+        index, integral = traced.kept
+        integral.backward([dr.gather(mi.Float, g, index) for g in gradients[:5]])
 
     def forward(self, traced: Traced) -> list[Any]:
         """The derivatives of ``outputs`` along the gradients of the parameters."""
         camera = traced.camera
-        tangents = [dr.zeros(mi.Float, len(traced.seen.index)) for _ in range(5)]
-        dr.make_opaque(tangents)
-        for index, rays in chunks(self._fields, _rays(camera, traced.hit)):
-            integral = Integral(self._fields, rays, dr.ADMode.Forward)
-            for tangent, slope in zip(tangents, integral.forward(), strict=True):
-                dr.scatter(tangent, slope, index)
-            dr.eval(tangents)
+        tangents = push_forward(self._fields, _rays(camera, traced.hit))
         return tangents + self._backdrop.forward(camera.ray, camera.sampler, traced.light)
 
 

@@ -20,6 +20,7 @@ from mitsuba.python.ad.integrators.common import ADIntegrator
 
 from ..base.errors import InputError
 from .colors import Radiance, polarized, unpolarized
+from .placement import is_field
 
 _AXES = (".X", ".Y", ".Z")
 
@@ -278,14 +279,21 @@ class FieldIntegrator(ADIntegrator):
 
     def _sensor(self, scene: mi.Scene, sensor: int | mi.Sensor) -> mi.Sensor:
         """The sensor meant by an index or given as such."""
-        if not isinstance(sensor, int):
-            return sensor
-        sensors = scene.sensors()
-        if sensor >= len(sensors):
+        if isinstance(sensor, int):
+            sensors = scene.sensors()
+            if not 0 <= sensor < len(sensors):
+                raise InputError(
+                    f"{self.plugin}: sensor {sensor} of {len(sensors)}: the scene has no such "
+                    "sensor"
+                )
+            sensor = sensors[sensor]
+        medium = sensor.get_medium()
+        if medium is not None and not is_field(medium):
             raise InputError(
-                f"{self.plugin}: sensor {sensor} of {len(sensors)}: the scene has no such sensor"
+                f"{self.plugin}: the sensor '{sensor.id()}' is in a medium, expected it outside "
+                "of all but 'nerfmedium'"
             )
-        return sensors[sensor]
+        return sensor
 
     def _passes(
         self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int, limit: int

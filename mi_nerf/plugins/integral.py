@@ -217,6 +217,27 @@ def few(fields: list[SampledField], rays: Rays) -> bool:
     return len(rays.o[0]) * most <= _FEW
 
 
+def pull_back(fields: list[SampledField], rays: Rays, gradients: list[Any]) -> None:
+    """Carries gradients of the five ``values`` of R rays to the parameters of the fields."""
+    if not any(marched.differentiable for marched in fields):
+        return
+    for index, part in chunks(fields, rays):
+        integral = Integral(fields, part, dr.ADMode.Backward)
+        integral.backward([dr.gather(mi.Float, g, index) for g in gradients])
+
+
+def push_forward(fields: list[SampledField], rays: Rays) -> list[Any]:
+    """The derivatives of the five ``values`` of R rays along the gradients of parameters."""
+    tangents = [dr.zeros(mi.Float, len(rays.o[0])) for _ in range(5)]
+    dr.make_opaque(tangents)
+    for index, part in chunks(fields, rays):
+        integral = Integral(fields, part, dr.ADMode.Forward)
+        for tangent, slope in zip(tangents, integral.forward(), strict=True):
+            dr.scatter(tangent, slope, index)
+        dr.eval(tangents)
+    return tangents
+
+
 def chunks(
     fields: list[SampledField], rays: Rays, *, whole: bool = False
 ) -> Iterator[tuple[Any, Rays]]:

@@ -22,6 +22,9 @@ class MarchingIntegrator(FieldIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.samples = self._integer(props, "samples", 0, least=1)
+        self.fine = props.get("fine", None)
+        if self.fine is not None and self.fine < 0:
+            raise self._unlike("fine", self.fine, "0 or more")
         self.rule = props.get("rule", None)
         if self.rule not in (None, *get_args(Rule)):
             raise self._unlike("rule", f"'{self.rule}'", " or ".join(get_args(Rule)))
@@ -42,6 +45,7 @@ class MarchingIntegrator(FieldIntegrator):
         """For ``to_string``."""
         return (
             f"  samples = {self.samples or 'from field file'},\n"
+            f"  fine = {'from field file' if self.fine is None else self.fine},\n"
             f"  near = {self.near}, far = {self.far},\n"
             f"  rule = {self.rule or 'from field file'},\n"
             f"  stop = {'from field file' if self.stop is None else self.stop},\n"
@@ -53,20 +57,34 @@ class MarchingIntegrator(FieldIntegrator):
         """One offset a ray, or ``None``."""
         return sampler.next_1d() if self.jitter else None
 
-    def _marched(self, found: list[PlacedField], encoded: bool = False) -> list[SampledField]:
-        """The fields of the scene, and how they are sampled."""
+    def _marched(
+        self, found: list[PlacedField], encoded: bool = False, coarse: bool = False
+    ) -> list[SampledField]:
+        """The fields of the scene, and how they are sampled.
+
+        Args:
+            coarse: shows their coarse networks instead.
+        """
         fields = []
+        pairs = [placed for placed in found if placed.medium.field.coarse is not None]
+        if self.fine and found and not pairs:
+            raise self._unlike("fine", self.fine, "a field with a coarse network, that places them")
         for placed in found:
+            if coarse and placed not in pairs:
+                raise self._unlike(
+                    "network", "coarse", f"a field with a coarse network in '{placed.shape.id()}'"
+                )
             own = placed.medium.march
             march = replace(
                 own,
                 samples=self.samples or own.samples,
                 near=None,
                 far=None,
+                fine=0 if coarse else own.fine if self.fine is None else self.fine,
                 rule=self.rule or own.rule,
                 stop=own.stop if self.stop is None else self.stop,
             )
-            fields.append(SampledField(placed, march, self.near, self.far, encoded))
+            fields.append(SampledField(placed, march, self.near, self.far, encoded, coarse))
         return fields
 
     def _wants_normals(self, fields: list[SampledField]) -> bool:

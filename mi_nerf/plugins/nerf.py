@@ -8,11 +8,13 @@ import drjit as dr
 import mitsuba as mi
 
 from ..base.errors import InputError
-from .backdrop import Backdrop, Environment, Surfaces, check_nested
+from .backdrop import Backdrop, Environment, Surfaces, check_nested, knows_media
 from .colors import check_encoded
 from .field_scene import FieldScene
-from .film import FieldIntegrator
+from .film import FieldIntegrator, TracedScene
+from .fog_scene import FogScene
 from .marching import MarchingIntegrator
+from .media import media_of
 from .placement import find_fields
 from .solid_scene import SolidScene, has_surfaces
 
@@ -43,6 +45,15 @@ class NerfIntegrator(MarchingIntegrator):
        - |int|
        - Strata along each ray between entry and exit of a field's box.
          (Default: what the field file suggests)
+     * - fine
+       - |int|
+       - More samples along each ray, where the field's coarse network sees something (hierarchical
+         sampling, NeRF Sec. 5.2); 0 switches it off. (Default: what the field file suggests)
+     * - network
+       - |string|
+       - Which one of a field with two networks is shown: ``fine``, whose samples the other one
+         places, or ``coarse`` itself, at ``samples`` places. A training loop renders both.
+         (Default: ``fine``)
      * - near, far
        - |float|
        - Fixed bounds of the distance along the ray, in world units, within the boxes.
@@ -96,6 +107,13 @@ class NerfIntegrator(MarchingIntegrator):
     cubes, so fields cast no shadows and are missing in mirrors; :monosp:`nerf_path` has both. What
     is seen through a surface that is not opaque is likewise without fields.
 
+    Media of Mitsuba's own, homogeneous or heterogeneous, may stand beside the fields where
+    :monosp:`volpath`, :monosp:`volpathmis` or :monosp:`prbvolpath` is nested: what lies behind
+    them is weakened by them, what they scatter towards the camera by the fields before them
+    (:py:mod:`mi_nerf.plugins.fog_scene`). They are not lit or shaded by fields. They end where the
+    box of a field begins, in shapes with the BSDF :monosp:`null`. A ray that comes to a field
+    through fog asks the nested integrator twice, and a single sample may be negative there.
+
     The alpha channel of an RGBA film is the opacity of the fields; with a nested integrator,
     its alpha channel with the fields in front. The colour of a field trained on sRGB images is
     composited as in training and then decoded: with C the colour under the field's weights and
@@ -132,6 +150,9 @@ class NerfIntegrator(MarchingIntegrator):
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
         self.encoded = bool(props.get("encoded", False))
+        self.network = str(props.get("network", "fine"))
+        if self.network not in ("fine", "coarse"):
+            raise self._unlike("network", f"'{self.network}'", "fine or coarse")
         self.nested = self._find_nested(props)
         self._solid, self._warned = SolidScene(), False
 
@@ -160,14 +181,14 @@ class NerfIntegrator(MarchingIntegrator):
         return (
             "NerfIntegrator[\n"
             f"{self._settings()}"
-            f"  encoded = {self.encoded},\n"
+            f"  network = {self.network}, encoded = {self.encoded},\n"
             f"  nested = {self.nested}\n"
             "]"
         )
 
-    def _scene(self, scene: mi.Scene) -> FieldScene:
+    def _scene(self, scene: mi.Scene) -> TracedScene:
         """The scene as it is now."""
-        found = find_fields(scene)
+        found = find_fields(scene, others=knows_media(self.nested))
         encoded = self.encoded and found[0].medium.field.color_space == "srgb"
         if self.encoded and (len(found) > 1 or self.nested is not None):
             raise InputError(
@@ -176,17 +197,20 @@ class NerfIntegrator(MarchingIntegrator):
             )
         if encoded:
             check_encoded(self.plugin)
-        fields = self._marched(found, encoded)
+        fields = self._marched(found, encoded, self.network == "coarse")
         normals = self._wants_normals(fields)
         backdrop: Backdrop
         if self.nested is None:
             self._warn_of_surfaces(scene)
             backdrop = Environment(scene, self.show_background, encoded)
         else:
-            backdrop = Surfaces(self._solid.of(scene), self.nested, self.paths, normals)
+            solid = self._solid.of(scene)
+            backdrop = Surfaces(solid, self.nested, self.paths, normals)
+            if media_of(solid):
+                return FogScene(fields, solid, backdrop, normals)
         return FieldScene(fields, backdrop, normals)
 
-    def _trains(self, view: FieldScene, sensor: mi.Sensor, spp: int) -> bool:
+    def _trains(self, view: FieldScene | FogScene, sensor: mi.Sensor, spp: int) -> bool:
         rays = int(dr.prod(sensor.film().crop_size())) * (spp or sensor.sampler().sample_count())
         frozen = dr.flag(dr.JitFlag.FreezingScope)
         return view.trained and rays <= _BATCH and not self.aovs and not frozen

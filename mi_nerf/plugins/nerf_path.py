@@ -46,6 +46,10 @@ class NerfPathIntegrator(MarchingIntegrator):
        - |int|
        - Strata along each segment between entry and exit of a field's box.
          (Default: what the field file suggests)
+     * - fine
+       - |int|
+       - More samples along each segment, as in :monosp:`nerf`.
+         (Default: what the field file suggests)
      * - near, far
        - |float|
        - Fixed bounds of the distance along camera rays, in world units, within the boxes. Neither

@@ -55,7 +55,8 @@ class NerfMedium(mi.Medium):
        - |exposed|, |differentiable|
      * - (weights)
        - |tensor|
-       - All tensors of the network, e.g. ``trunk_0_weight``, or the formula's parameters.
+       - All tensors of the network, e.g. ``trunk_0_weight``, or the formula's parameters; of a
+         coarse network that places samples, the same with ``coarse_`` in front.
        - |exposed|, |differentiable|
 
     **Formulas** (:py:mod:`mi_nerf.fields.closed_form` has the equations and defaults). Lengths are
@@ -240,6 +241,10 @@ class NerfMedium(mi.Medium):
         parameters = self.field.parameters()
         for public, name in self._names.items():
             callback.put(public, parameters[name], mi.ParamFlags.Differentiable)
+        if self.field.coarse is not None:
+            parameters = self.field.coarse.parameters()
+            for public, name in self._names.items():
+                callback.put(f"coarse_{public}", parameters[name], mi.ParamFlags.Differentiable)
         callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
 
     def parameters_changed(self, keys: list[str] | None = None) -> None:

@@ -73,28 +73,31 @@ class PlacedField:
         return _product(_product([row[:3] for row in inverse], change), [*inverse, last])
 
 
-def find_fields(scene: mi.Scene, *, least: int = 1) -> list[PlacedField]:
+def find_fields(scene: mi.Scene, *, least: int = 1, others: bool = False) -> list[PlacedField]:
     """The radiance fields of a scene, in the alphabetical order of their cubes' ids.
 
     Cubes that Mitsuba has merged follow each other in their order.
 
     Args:
         least: 0 if there need not be any.
+        others: whether media of other kinds may stand beside them.
 
     Raises:
         InputError: if there is none, one is not in a cube or squashed flat, several include
-            one in normalised device coordinates, or the scene holds a medium of another kind.
+            one in normalised device coordinates, or the scene holds a medium of another kind
+            that may not.
     """
     found = []
     for shape in sorted(scene.shapes(), key=lambda shape: str(shape.id())):
         for medium in (shape.interior_medium(), shape.exterior_medium()):
-            if medium is not None and not is_field(medium):
+            if not others and medium is not None and not is_field(medium):
                 raise InputError(
                     f"nerf: shape '{shape.id()}' holds a medium of type '{medium.class_name()}', "
-                    "expected no medium but 'nerfmedium'"
+                    "expected no medium but 'nerfmedium', or the integrator 'nerf' with 'volpath', "
+                    "'volpathmis' or 'prbvolpath' nested in it"
                 )
         medium = shape.interior_medium()
-        if medium is not None:
+        if medium is not None and is_field(medium):
             if shape.is_emitter():
                 raise InputError(
                     f"nerfmedium: the cube '{shape.id()}' is a light source, "

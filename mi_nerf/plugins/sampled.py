@@ -26,11 +26,13 @@ class SampledField:
     near: float | None  # along rays, world units; None: what the field file says
     far: float | None
     encoded: bool = False  # leave colours in the space in which they were composited
+    coarse: bool = False  # show the network that places the samples of the other one
 
     @property
     def field(self) -> Any:
         """The field."""
-        return self.placed.medium.field
+        field = self.placed.medium.field
+        return field.coarse if self.coarse else field
 
     @property
     def marched(self) -> MarchedField:
@@ -52,7 +54,7 @@ class SampledField:
         """What rays see, see :func:`mi_nerf.march.walk.walk_rays`; and local per world length."""
         o, d, scale = self.placed.to_local(rays.o, rays.d)
         dr.eval(o, d, scale)
-        bounds = self.bounds(rays.reach, scale)
+        bounds = self.bounds(rays.reach, scale, rays.start)
         marched, jitter = self.marched, rays.jitter
         return walk_rays(marched, o, d, jitter=jitter, bounds=bounds, emission=emission), scale
 
@@ -60,20 +62,22 @@ class SampledField:
         """The same field for rays that do not come from a camera: near and far are its."""
         return replace(self, near=0.0, far=math.inf)
 
-    def bounds(self, reach: Any, scale: Any) -> tuple[Any, Any]:
-        """Bounds of t in field units: the integrator's or the file's, and ``reach``."""
+    def bounds(self, reach: Any, scale: Any, start: Any = None) -> tuple[Any, Any]:
+        """Bounds of t in field units: the integrator's or the file's, and those of the rays."""
         march = self.placed.medium.march
         near = mi.Float(march.near or 0) if self.near is None else self.near * scale
         far = mi.Float(dr.inf if march.far is None else march.far)
         if self.far is not None:
             far = self.far * scale
+        if start is not None:
+            near = dr.fmax(near, start * scale)
         return near, dr.fmin(far, reach * scale)
 
     def hit(self, rays: Rays) -> Any:
         """Which rays cross the box within their bounds."""
         o, d, scale = self.placed.to_local(rays.o, rays.d)
         dr.eval(o, d, scale)
-        return ray_segments(self.field, o, d, self.bounds(rays.reach, scale)).hit
+        return ray_segments(self.field, o, d, self.bounds(rays.reach, scale, rays.start)).hit
 
     @property
     def differentiable(self) -> bool:
@@ -92,13 +96,15 @@ class Rays:
     reach: Any  # R distances: of a surface, or of the far clip plane
     jitter: Any  # R numbers in [0, 1), or None
     wavelengths: Any = None  # in spectral variants
+    start: Any = None  # R distances from which on fields are to be seen, or None: from the origin
 
     def take(self, index: Any) -> Rays:
         """Some of them."""
         o, d = gather_vector3(self.o, index), gather_vector3(self.d, index)
         reach = dr.gather(mi.Float, self.reach, index)
         jitter = None if self.jitter is None else dr.gather(mi.Float, self.jitter, index)
-        w = self.wavelengths
+        w, start = self.wavelengths, self.start
         w = None if w is None else dr.gather(type(w), w, index)
-        dr.eval(o, d, reach, jitter, w)
-        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter, w)
+        start = None if start is None else dr.gather(mi.Float, start, index)
+        dr.eval(o, d, reach, jitter, w, start)
+        return Rays(mi.Point3f(o), mi.Vector3f(d), reach, jitter, wavelengths=w, start=start)

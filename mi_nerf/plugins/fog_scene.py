@@ -1,0 +1,193 @@
+"""A scene with media of Mitsuba's own, as camera rays find it: fields in front of and behind fog.
+
+Along a ray, gaps without any medium follow each other, 0 … n, with media between them, and fields
+are in the gaps alone. Let C_j and O_j be colour and opacity of the fields in gap j, T_j what the
+media before it let pass, V_j = Π_{i≤j} (1 − O_i) what the fields up to its end do, and X_j what the
+nested integrator returns for the ray from the beginning of the gap on. It knows no fields, so what
+the media j send towards the camera is X_{j−1} − (T_j / T_{j−1}) X_j, and together they show
+
+    L = Σ_j T_j V_{j−1} C_j + Σ_j V_{j−1} (T_{j−1} X_{j−1} − T_j X_j) + T_n V_n X_n
+      = X_0 + Σ_j T_j V_{j−1} (C_j − O_j X_j).
+
+Each X_j is an estimate of its own and so is T_j where a medium is uneven: the mean is right, a
+single value may be negative. Without media this is C_0 + (1 − O_0) X_0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from ..base.errors import InputError
+from ..march.intervals import ray_segments
+from .backdrop import Hit, Light, Surfaces
+from .colors import CHANNELS, Radiance, Spectrum
+from .field_scene import Traced
+from .film import CameraRays, Channels
+from .integral import Seen, pull_back, push_forward, see
+from .media import OVERLAP, Fog, Gap, Passed, Way, find_way, media_of
+from .sampled import Rays, SampledField
+
+
+@dataclass(frozen=True)
+class InGap:
+    """What camera rays find in one of their gaps."""
+
+    gap: Gap
+    seen: Seen  # of the fields in it
+    active: Any  # where it matters what is behind them
+    light: Light  # from the beginning of the gap on
+    passed: Passed | None  # by the media before it; None for the first gap
+
+    @property
+    def outputs(self) -> list[Any]:
+        """What has derivatives: five values of the fields, colours behind, what media let pass."""
+        passed = [] if self.passed is None else self.passed.share
+        return [*self.seen.values, *self.light.radiance, *passed]
+
+
+@dataclass(frozen=True)
+class TracedInFog:
+    """What the camera rays of one pass have found."""
+
+    camera: CameraRays
+    hit: Hit
+    parts: list[InGap]
+
+    @property
+    def outputs(self) -> list[Any]:
+        """The arrays of which the channels are made."""
+        return [output for part in self.parts for output in part.outputs]
+
+    def channels(self) -> Channels:
+        """As :class:`Traced` has them; media count in color and alpha alone."""
+        first = self.parts[0]
+        color, through = Spectrum(0), mi.Float(1)
+        depth, normal = mi.Float(0), mi.Normal3f(0)
+        most, index = mi.Float(0), mi.Float(0)
+        for part in self.parts:
+            seen, light = part.seen, Spectrum(*part.light.radiance)
+            if part.passed is None:
+                color += (1 - seen.opacity) * light
+            else:
+                passed = Spectrum(*part.passed.share)
+                color += passed * through * (seen.color - seen.opacity * light)
+            share = through * seen.opacity
+            depth += share * seen.values[4]
+            normal += dr.detach(share) * seen.normal
+            more = dr.detach(share) > most
+            most = dr.select(more, dr.detach(share), most)
+            index = dr.select(more, seen.index, index)
+            through *= 1 - seen.opacity
+        opacity = 1 - through
+        inverse = dr.select(opacity > 0, 1 / dr.select(opacity > 0, opacity, 1), 0)
+        values = [*first.seen.values[:3], opacity, depth * inverse]
+        whole = Seen(values, normal * dr.detach(inverse), mi.Float(index))
+        channels = Traced(self.camera, self.hit, whole, first.light).channels()
+        return channels | {"color": Radiance(first.seen.values[:3], color)}
+
+
+class FogScene:
+    """Fields, surfaces and media of a scene, for the time of one rendering."""
+
+    trained = False  # its derivatives have samples of their own
+
+    def __init__(
+        self, fields: list[SampledField], solid: mi.Scene, surfaces: Surfaces, normals: bool
+    ):
+        """
+        Args:
+            solid: the scene without the cubes of fields.
+            surfaces: the same as the nested integrator shows it.
+        """
+        self._fields, self._solid, self._surfaces = fields, solid, surfaces
+        self._normals = normals
+        self._uneven = any(not medium.is_homogeneous() for _, medium in media_of(solid))
+
+    def trace(self, camera: CameraRays, *, keep: bool = False) -> TracedInFog:
+        """What the rays of a pass see, without derivatives; nothing is kept for these."""
+        way = find_way(self._solid, camera.ray)
+        for fog in (fog for fogs in way.fogs for fog in fogs):
+            self._check_apart(fog, camera)
+        hit = Hit(way.distance, way.normal)
+        random = self._random(camera)
+        parts: list[InGap] = []
+        for number, gap in enumerate(way.gaps):
+            seen = see(self._fields, _rays(camera, gap), normals=self._normals)
+            active = gap.there & (seen.opacity > 0)
+            if number and not dr.any(active):
+                continue
+            active = active if number else mi.Bool(True)
+            light = self._surfaces.shade(hit, gap.ray, camera.sampler, seen.opacity, active)
+            passed = self._passed(way, number, camera, active, random) if number else None
+            parts.append(InGap(gap, seen, active, light, passed))
+        return TracedInFog(camera, hit, parts)
+
+    def backward(self, traced: TracedInFog, gradients: list[Any]) -> None:
+        """Carries the gradients of ``outputs`` to the parameters of the scene."""
+        camera, gradients = traced.camera, list(gradients)
+        for part in traced.parts:
+            count = len(part.outputs)
+            own, gradients = gradients[:count], gradients[count:]
+            ray, sampler = part.gap.ray, camera.sampler
+            self._surfaces.backward(ray, sampler, part.light, own[5 : 5 + CHANNELS], part.active)
+            if part.passed is not None:
+                part.passed.backward(own[5 + CHANNELS :])
+            pull_back(self._fields, _rays(camera, part.gap), own[:5])
+
+    def forward(self, traced: TracedInFog) -> list[Any]:
+        """The derivatives of ``outputs`` along the gradients of the parameters."""
+        camera, slopes = traced.camera, []
+        for part in traced.parts:
+            slopes += push_forward(self._fields, _rays(camera, part.gap))
+            ray, sampler = part.gap.ray, camera.sampler
+            slopes += self._surfaces.forward(ray, sampler, part.light, part.active)
+            if part.passed is not None:
+                slopes += part.passed.forward()
+        return slopes
+
+    def _passed(
+        self, way: Way, number: int, camera: CameraRays, active: Any, random: Any
+    ) -> Passed:
+        """What media let pass as far as a gap."""
+        fogs = [fog for fogs in way.fogs[:number] for fog in fogs]
+        return Passed(fogs, camera.ray, active, random, self._uneven)
+
+    def _random(self, camera: CameraRays) -> Any:
+        """A generator for each ray, where media are uneven."""
+        if not self._uneven:
+            return None
+        sampler, count = camera.sampler.clone(), dr.width(camera.ray)
+        bits = [dr.reinterpret_array(mi.UInt32, sampler.next_1d()) for _ in range(2)]
+        state = mi.sample_tea_32(dr.arange(mi.UInt32, count) ^ bits[0], bits[1])
+        wide = (mi.UInt64(state[0]) << 32) | mi.UInt64(state[1])
+        random = mi.PCG32(initstate=wide, initseq=dr.arange(mi.UInt64, count))
+        dr.eval(random)
+        return random
+
+    def _check_apart(self, fog: Fog, camera: CameraRays) -> None:
+        """Refuses fields in whose boxes there is a medium."""
+        ray = camera.ray
+        for marched in self._fields:
+            o, d, scale = marched.placed.to_local(ray.o, ray.d)
+            whole = ray_segments(marched.field, o, d)
+            both = ray_segments(marched.field, o, d, (fog.start * scale, fog.end * scale))
+            shared = both.far - both.near > OVERLAP * (whole.far - whole.near)
+            bad = dr.compress(fog.there & both.hit & shared)
+            if len(bad):
+                medium = dr.gather(mi.MediumPtr, fog.medium, mi.UInt32(bad))[0]
+                names = [shape.id() for shape, held in media_of(self._solid) if held == medium]
+                raise InputError(
+                    f"nerf: the medium of shape '{names[0]}' reaches into the box of the field in "
+                    f"'{marched.placed.shape.id()}', expected media that end before it"
+                )
+
+
+def _rays(camera: CameraRays, gap: Gap) -> Rays:
+    """The camera rays within a gap."""
+    ray = camera.ray
+    reach = dr.fmin(gap.end, ray.maxt)
+    return Rays(ray.o, ray.d, reach, camera.random, wavelengths=ray.wavelengths, start=gap.start)

@@ -1,0 +1,263 @@
+"""Media of Mitsuba's own beside fields: in the right order, against known answers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+import mi_nerf  # noqa: F401
+from tests.support.composed import (
+    GLOW,
+    boxes_seen,
+    camera_rays,
+    distance_to_wall,
+    lamp,
+    matrix_of,
+    nerf,
+    place,
+    render,
+    rgb,
+    scene_of,
+    slab,
+)
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+EXTINCTION = np.array([0.5, 0.8, 1.1])
+BACK = 3.2  # where the lamp is
+
+
+def bank(
+    y: float, depth: float, uneven: bool = False, albedo: float = 0.0, high: float = 6.0
+) -> dict[str, Any]:
+    """Fog across the view from y to y + depth.
+
+    An uneven one has a grid that is constant as far as one sees, and denser in a corner: so
+    some of the collisions that Mitsuba samples are none.
+    """
+    fill = place().translate([0, y + depth / 2, 0]).scale([6, depth / 2, high])
+    medium: dict[str, Any] = {"type": "homogeneous", "sigma_t": rgb(EXTINCTION / 2)}
+    if uneven:
+        corner = fill.translate([-1, -1, -1]).scale(2)
+        grid = np.tile(np.float32(EXTINCTION / 2), (7, 7, 7, 1))
+        grid[0, 0, 0] = 1.0
+        values = mi.VolumeGrid(grid)
+        volume = {"type": "gridvolume", "grid": values, "to_world": corner, "raw": True}
+        medium = {"type": "heterogeneous", "sigma_t": volume}
+    medium |= {"albedo": albedo, "scale": 2.0}
+    return {"type": "cube", "to_world": fill, "bsdf": {"type": "null"}, "interior": medium}
+
+
+def check(errors: np.ndarray, floor: float = 5e-3) -> None:
+    """That K pictures are 0 on average: in every pixel, and in the mean over all."""
+    error = errors.std(axis=0, ddof=1) / np.sqrt(len(errors))
+    z = errors.mean(axis=0) / np.hypot(error, floor)
+    assert np.abs(z).max() < 8 and z.std() < 1.5
+    whole = np.abs(errors.mean(axis=(0, 1, 2)))
+    assert (whole < 5 * np.sqrt((error**2).mean(axis=(0, 1)) / error[..., 0].size) + 1e-4).all()
+
+
+# ---- Closed forms ----------------------------------------------------------------
+
+
+def closed_form(
+    o: np.ndarray, d: np.ndarray, layers: list[tuple[str, Any]], extinction: Any = EXTINCTION
+) -> np.ndarray:
+    """What rays see of layers one behind the other: boxes of fields, and depths of fog."""
+    color, through = np.zeros((len(o), 3)), np.ones((len(o), 3))
+    for kind, what in layers:
+        if kind == "field":
+            seen = boxes_seen(o, d, [what], distance_to_wall(o, d, BACK))
+            color += through * seen[:, :3]
+            through = through * (1 - seen[:, 3:4])
+        else:
+            through = through * np.exp(-what / d[:, 1:2] * extinction)
+    return color + through * np.array(GLOW)
+
+
+ORDERS = {  # fog by where it begins
+    "fog, field": [-1.6, "here"],
+    "field, fog": ["here", 0.7],
+    "fog, field, fog": [-1.6, "here", 0.7],
+    "field, fog, field": ["here", 0.7, "beyond"],
+}
+DEPTH = 0.8
+
+
+def box_of(name: str) -> tuple[Any, float, Any]:
+    """Place, density and radiance of a field."""
+    if name == "here":
+        return place().scale([0.9, 0.5, 0.7]), 0.9, (0.2, 0.7, 1.3)
+    beyond = place().translate([0.2, 2.2, 0]).rotate([0, 1, 0], 30).scale([0.9, 0.5, 0.9])
+    return beyond, 1.7, (0.1, 0.3, 1.1)
+
+
+def layered(order: str, integrator: dict[str, Any], uneven: bool = False) -> dict[str, Any]:
+    objects = {
+        f"part_{i}": slab(*box_of(what)) if isinstance(what, str) else bank(what, DEPTH, uneven)
+        for i, what in enumerate(ORDERS[order])
+    }
+    return scene_of(integrator, back=lamp(BACK), **objects)
+
+
+def layers_of(order: str) -> list[tuple[str, Any]]:
+    """For ``closed_form``."""
+    fields = {name: box_of(name) for name in ("here", "beyond")}
+    return [
+        ("field", (matrix_of(fields[what][0]), *fields[what][1:]))
+        if isinstance(what, str)
+        else ("fog", DEPTH)
+        for what in ORDERS[order]
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("nested", "order", "uneven"),
+    [
+        ("volpath", "field, fog, field", False),
+        ("volpath", "fog, field, fog", True),
+        ("volpathmis", "fog, field", False),
+        ("prbvolpath", "field, fog", False),
+        ("prbvolpath", "field, fog, field", True),
+    ],
+)
+def test_layers_agree_with_their_closed_form(nested: str, order: str, uneven: bool) -> None:
+    """Rays differ from seed to seed: each picture is compared with what its own rays see."""
+    integrator = nerf(nested, samples=4, paths=16, jitter=False)
+    scene, runs = mi.load_dict(layered(order, integrator, uneven)), 12
+    layers = layers_of(order)
+    errors = []
+    for seed in range(runs):
+        expected = closed_form(*camera_rays(scene, seed), layers).reshape(12, 16, 3)
+        errors.append(render(scene, seed=seed)[..., :3] - expected)
+    check(np.stack(errors))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("banks", "uneven"), [([0.8], False), ([-1.6, 0.8], True)])
+def test_light_that_fog_scatters_agrees_with_volpath(banks: list[float], uneven: bool) -> None:
+    """A field that only absorbs, before a fog bank, as volpath shows such a medium.
+
+    Banks are lit from straight above, so that no light comes through the field to them.
+    """
+    cube = place().scale(0.6)
+    light = {"type": "directional", "direction": [0, 0, -1], "irradiance": rgb((20, 18, 16))}
+    dark = {"type": "homogeneous", "albedo": 0.0, "sigma_t": 0.9, "scale": 1 / 0.6}
+    among = {f"fog_{i}": bank(y, 0.6, uneven, 0.7, high=0.9) for i, y in enumerate(banks)}
+    among["light"] = light
+    short = {"type": "volpath", "max_depth": 2}
+    field = slab(cube, 0.9, (0, 0, 0))
+    ours = mi.load_dict(scene_of(nerf(short, samples=4), field=field, **among))
+    medium = {"type": "cube", "to_world": cube, "bsdf": {"type": "null"}, "interior": dark}
+    theirs = mi.load_dict(scene_of(short, medium=medium, **among))
+    none = mi.load_dict(scene_of(short, **among))
+    seeds = range(12)
+    one, two, three = (
+        np.stack([render(scene, spp=64, seed=97 * i + j)[..., :3] for i in seeds])
+        for j, scene in enumerate((ours, theirs, none))
+    )
+    check(one - two, floor=2e-3)
+    assert np.abs((one - three).mean(axis=0)).max() > 0.05  # the field matters
+
+
+# ---- Derivatives -----------------------------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("uneven", [False, True])
+def test_gradients_agree_with_those_of_the_closed_form(uneven: bool) -> None:
+    """Of all pixels, with respect to what the fog absorbs, and how dense the field behind is."""
+    scene = mi.load_dict(layered("fog, field", nerf("prbvolpath", samples=4, jitter=False), uneven))
+    params = mi.traverse(scene)
+    name = "data" if uneven else "value.value"
+    keys = [f"part_0.interior_medium.sigma_t.{name}", "part_1.interior_medium.density"]
+    dr.enable_grad([params[key] for key in keys])
+    params.update()
+    found = []
+    for seed in range(12):
+        image = mi.render(scene, params, spp=32, seed=seed, seed_grad=1000 + seed)
+        dr.backward(dr.mean(image[..., :3], axis=None) * 3)
+        of_fog, of_field = (np.array(dr.grad(params[key]), np.float64) for key in keys)
+        of_fog = of_fog.reshape(-1, 3).sum(axis=0) if uneven else of_fog.ravel()
+        found.append([*(of_fog / 2), of_field.item()])  # the scale of the medium is 2
+        dr.set_grad(params[keys[0]], 0), dr.set_grad(params[keys[1]], 0)
+    o, d = camera_rays(scene)
+    move, density, color = box_of("here")
+
+    def mean(extinction: np.ndarray, density: float) -> np.ndarray:
+        layers = [("fog", DEPTH), ("field", (matrix_of(move), density, color))]
+        return closed_form(o, d, layers, extinction).mean(axis=0)
+
+    step = 1e-4
+    expected = [
+        *(mean(EXTINCTION + step, density) - mean(EXTINCTION - step, density)) / (2 * step),
+        (mean(EXTINCTION, density + step) - mean(EXTINCTION, density - step)).sum() / (2 * step),
+    ]
+    error = np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
+    off = np.mean(found, axis=0) - expected
+    assert (np.abs(off) < 5 * error + 2e-3 * np.abs(expected)).all()
+    assert (error < 0.05 * np.abs(expected)).all()
+
+
+@pytest.mark.slow
+def test_forward_derivatives_are_those_of_backward_mode() -> None:
+    scene = mi.load_dict(layered("fog, field, fog", nerf("volpath", jitter=False)))
+    params = mi.traverse(scene)
+    key = "part_1.interior_medium.density"
+
+    def attached() -> tuple[Any, Any]:
+        x = mi.Float(0.0)
+        dr.enable_grad(x)
+        params[key] = mi.TensorXf(x + 0.9)
+        params.update()
+        return x, dr.sum(mi.render(scene, params, spp=4, seed_grad=3), axis=None)
+
+    x, loss = attached()
+    dr.backward(loss)
+    y, loss = attached()
+    dr.forward(y)
+    assert float(dr.grad(loss).array[0]) == pytest.approx(float(dr.grad(x)[0]), rel=1e-3)
+    assert abs(float(dr.grad(x)[0])) > 1e-2
+
+
+@pytest.mark.slow
+def test_pictures_compile_nothing_after_the_first_ones() -> None:
+    scene = mi.load_dict(layered("field, fog, field", nerf("volpath")))
+    missed = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        for seed in range(4):
+            dr.kernel_history_clear()
+            dr.eval(mi.render(scene, spp=4, seed=seed))
+            missed.append(sum(k.get("cache_hit") == 0 for k in dr.kernel_history()))
+        dr.kernel_history_clear()
+    assert missed[2:] == [0, 0]
+
+
+# ---- Bad input -------------------------------------------------------------------
+
+
+def refused(
+    integrator: dict[str, Any], sensor: dict[str, Any] | None = None, **objects: Any
+) -> str:
+    scene = scene_of(integrator, **objects)
+    scene["sensor"] |= sensor or {}
+    with pytest.raises(RuntimeError) as failure:
+        render(scene)
+    return f"{failure.value} {failure.value.__cause__}"
+
+
+def test_what_is_refused() -> None:
+    field, fog = slab(place(), 1.0, GLOW), bank(1.5, 1.0)
+    for integrator in (nerf(None), nerf("path"), {"type": "nerf_path"}, {"type": "nerf_tracking"}):
+        said = refused(integrator, box=field, fog=fog)
+        assert "shape 'fog' holds a medium of type 'HomogeneousMedium', expected no" in said
+    said = refused(nerf("volpath"), box=field, fog=bank(0.5, 1.0))
+    assert "medium of shape 'fog' reaches into the box of the field in 'box', expected" in said
+    inside = {"medium": bank(0, 1)["interior"], "id": "eye"}
+    said = refused(nerf("volpath"), inside, box=field)
+    assert "the sensor 'eye' is in a medium, expected it outside" in said
