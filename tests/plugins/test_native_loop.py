@@ -17,6 +17,10 @@ TINY = {"network.width": 16, "network.view_width": 16, "grid.log2_entries": 10, 
 TINY |= {"occupancy.resolution": 16}
 
 
+# Mitsuba 3.9.1 takes a new sensor at the address of a loader's sensor that is gone for the old one.
+_KEPT: list[Any] = []
+
+
 class Loop:
     """The loop of docs/mitsuba.md on a dataset."""
 
@@ -46,6 +50,7 @@ class Loop:
         self.loader = mi.ad.loaders.RayDataLoader(
             self.views, self.views.images(), pixels, regular_reshuffle=True, tile_size=1 << 20
         )
+        _KEPT.append(self.loader)
         self.params: Any = mi.traverse(self.scene)
         self.params.keep("box.interior_medium.(?!to_world)")
         self.optimizer = mi.ad.Adam(lr=1e-2, beta_2=0.99, params=self.params)

@@ -125,7 +125,7 @@ def test_it_stays_preset_fast_where_everything_is_needed(script: Script) -> None
     assert script.holds == [(0, True), (ASKED[-1] * 10000, False)]
     assert "would lose 2.00 dB, at once" in reason(decisions, "network.view_dependent")
     why = reason(decisions, "grid.log2_entries")
-    assert why.endswith("at once, after 2000 steps 2.00 with 2^15 dB")  # and not asked again
+    assert why.endswith("at once, after 2000 steps 2.00 dB with 2^15")  # and not asked again
 
 
 def test_what_is_nearly_needed_is_asked_about_again(script: Script) -> None:
@@ -133,7 +133,7 @@ def test_what_is_nearly_needed_is_asked_about_again(script: Script) -> None:
     config, decisions = begun()
     trainer = shaped(config, decisions)
     assert entries(trainer.config) == 16
-    assert reason(decisions, "grid.log2_entries").count("0.90 with 2^15") == len(ASKED)
+    assert reason(decisions, "grid.log2_entries").count("0.90 dB with 2^15") == len(ASKED)
 
 
 def test_what_is_not_missed_goes_at_once_and_together(script: Script) -> None:
