@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
 import mitsuba as mi
 
 from .field_scene import FieldScene
@@ -10,6 +14,7 @@ from .path_state import PathSettings
 from .paths import PathsBehind
 from .placement import find_fields
 from .solid_scene import SolidScene, check_no_loose_field
+from .wanted_gradients import check_gradients
 
 
 class NerfPathIntegrator(MarchingIntegrator):
@@ -109,6 +114,7 @@ class NerfPathIntegrator(MarchingIntegrator):
     """
 
     plugin = "nerf_path"
+    differentiable = True
     rays_per_pass = 1 << 20  # paths remember more than rays do
 
     def __init__(self, props: mi.Properties) -> None:
@@ -119,7 +125,28 @@ class NerfPathIntegrator(MarchingIntegrator):
         if props.get("max_depth", -1) < 0:  # the base class has a default of its own
             self.max_depth = _UNLIMITED
         self.sample_fields = bool(props.get("sample_fields", False))
-        self._solid = SolidScene()
+        self._solid, self._keep = SolidScene(), False
+
+    def render_backward(self, scene: mi.Scene, *args: Any, **options: Any) -> None:
+        """Carries the gradient of an image to the parameters; see :class:`FieldIntegrator`."""
+        check_gradients(scene, self.plugin)
+        with self._differentiating():
+            super().render_backward(scene, *args, **options)
+
+    def render_forward(self, scene: mi.Scene, *args: Any, **options: Any) -> Any:
+        """The derivative of an image along the gradients of the scene's parameters."""
+        check_gradients(scene, self.plugin)
+        with self._differentiating():
+            return super().render_forward(scene, *args, **options)
+
+    @contextmanager
+    def _differentiating(self) -> Iterator[None]:
+        """Scenes keep what derivatives need."""
+        self._keep = True
+        try:
+            yield
+        finally:
+            self._keep = False
 
     def to_string(self) -> str:
         """Lists the settings."""
@@ -147,6 +174,7 @@ class NerfPathIntegrator(MarchingIntegrator):
             sample_fields=self.sample_fields,
             jitter=self.jitter,
             stop=min((field.march.stop for field in fields), default=0.0),
+            keep=self._keep,
         )
         solid = self._solid.of(scene)
         return FieldScene(fields, PathsBehind(solid, fields, settings, normals), normals)
