@@ -27,7 +27,8 @@ Backwards, from a gradient of the image to parameters (``nerf``)::
           march.query.Evaluation.backward         block by block: to the network's weights
           crossing.Moving.backward                to the pose of medium and cube
 
-``nerf_path`` has another backdrop (paths.py), ``nerf_tracking`` another estimate of the integral.
+``nerf_path`` has another backdrop (paths.py), whose derivatives follow the same paths once more
+(path_replay.py, path_derivatives.py); ``nerf_tracking`` has another estimate of the integral.
 
 Plugin classes inherit from classes of the active Mitsuba variant, so the modules
 that define them are imported again whenever the variant changes.

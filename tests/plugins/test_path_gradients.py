@@ -254,7 +254,7 @@ def test_shadow_of_a_slab_agrees_with_the_exact_derivative() -> None:
 def test_light_of_a_box_agrees_with_the_derivative_of_its_closed_form(sampled: bool) -> None:
     """On a floor below: by the density of what shines, within noise, and by its colour."""
     move = place().translate([0.1, 0.2, 0.1]).rotate([0.3, 1, 0.2], 25).scale([0.5, 0.4, 0.3])
-    integrator = paths(max_depth=2, paths=64, sample_fields=sampled)
+    integrator = paths(max_depth=2, paths=500, samples=8, sample_fields=sampled)
     color = np.array([0.6, 0.5, 0.4])
     scene = mi.load_dict(scene_of(integrator, floor=floor(color), field=slab(move, 2.0, GLOW)))
     o, d = camera_rays(scene, seed=1)
@@ -274,9 +274,9 @@ def test_light_of_a_box_agrees_with_the_derivative_of_its_closed_form(sampled: b
     exact = (total(2.05) - total(1.95)) / 0.1
     by_color = pull[..., :3].reshape(-1, 3)[clear] @ color / np.pi
     radiance = float(np.sum(by_color * irradiance_of_box(p, move, 2.0)))
-    tolerance = 2e-2 if sampled else 6e-2
-    assert seen[keys[0]] == pytest.approx(exact, rel=tolerance)
-    assert seen[keys[1]] == pytest.approx(radiance, rel=tolerance)
+    # Standard errors: 3.5e-2, as short chords decide, and 1e-2. With 1500 paths: 4e-3, 5e-4 off.
+    assert seen[keys[0]] == pytest.approx(exact, rel=0.1)
+    assert seen[keys[1]] == pytest.approx(radiance, rel=3e-2)
 
 
 # ---- Replay ---------------------------------------------------------------------
@@ -335,11 +335,11 @@ def test_a_lamp_without_power_and_a_black_floor_have_derivatives() -> None:
     objects = {"floor": floor(), "light": light}
     key = "light.intensity.value"
     slopes = Slopes(scene_of(paths(max_depth=2), **objects), {key: plus}, pull_of())
-    assert slopes.backward(1, 1)[key] == pytest.approx(slopes.difference(key, 0.5, 1, 1), rel=1e-3)
+    assert slopes.backward(1, 1)[key] == pytest.approx(slopes.value(key, 1.0, 1, 1), rel=1e-3)
     objects = {"floor": floor((0, 0, 0)), "light": point_light((0.2, 0.1, 2.5))}
     key = "floor.bsdf.reflectance.value"
     slopes = Slopes(scene_of(paths(max_depth=2), **objects), {key: plus}, pull_of())
-    assert slopes.backward(1, 1)[key] == pytest.approx(slopes.difference(key, 0.1, 1, 1), rel=1e-3)
+    assert slopes.backward(1, 1)[key] == pytest.approx(slopes.value(key, 1.0, 1, 1), rel=1e-3)
 
 
 @pytest.mark.slow
