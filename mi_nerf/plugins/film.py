@@ -224,7 +224,8 @@ class FieldIntegrator(ADIntegrator):
     def _require_derivatives(self) -> None:
         if not self.differentiable:
             raise InputError(
-                f"{self.plugin}: has no derivatives, expected the integrator 'nerf' or 'nerf_path' for them"
+                f"{self.plugin}: has no derivatives, expected the integrator 'nerf' or "
+                "'nerf_path' for them"
             )
 
     def _weights(self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int) -> mi.ImageBlock:
