@@ -121,6 +121,7 @@ class NerfPathIntegrator(MarchingIntegrator):
     plugin = "nerf_path"
     differentiable = True
     rays_per_pass = 1 << 20  # paths remember more than rays do
+    rays_per_adjoint = 1 << (18 if mi.variant().startswith("cuda") else 14)  # and more to go back
 
     def __init__(self, props: mi.Properties) -> None:
         # Checked before the base class reads and refuses them.
