@@ -134,7 +134,7 @@ class Pose(Problem):
         # Numbers in the cube's own coordinates would be stretched: the world's are wanted.
         self._stretch = box
         off = self.rng.uniform(-0.25, 0.25, 3)
-        self.optimizer["where"] = mi.Point3f(*(np.array(self.where) + off))
+        self.optimizer["where"] = mi.Point3f(*(np.array(self.where) + off).tolist())
         self.optimizer["turn"] = mi.Float(np.radians(self.turn + self.rng.uniform(-25, 25)))
 
     def apply(self) -> None:
@@ -155,13 +155,13 @@ class Pose(Problem):
 class Light(Problem):
     """A colour and a power."""
 
-    iterations, rate = 100, 0.05
+    iterations, rate = 250, 0.08
     color, power = (0.7, 0.35, 0.2), 20.0
 
     def __init__(self, seed: int, folder: Path) -> None:
         camera = place().look_at(origin=[0.5, -4, 1.5], target=[0, 0, -0.6], up=[0, 0, 1])
         at = place().translate([0, 0, -0.5]).scale(0.45)
-        glow = mi.ScalarVector3f(6, 6, 6)
+        glow = mi.ScalarVector3f(12, 12, 12)
         scenes = []
         for _ in range(2):
             scene = _room(
