@@ -119,7 +119,7 @@ class Pose(Problem):
     """Three numbers of a place and one of a turn."""
 
     iterations, rate = 120, 0.03
-    where, turn = (0.9, -0.6, 0.2), 20.0  # degrees
+    where, turn = (1.2, -0.75, 0.2), 20.0  # degrees
 
     def __init__(self, seed: int, folder: Path) -> None:
         camera = place().look_at(origin=[0, -1, 0.5], target=[0, 1, -0.3], up=[0, 0, 1])
@@ -131,11 +131,18 @@ class Pose(Problem):
             for at in (moved, place())
         ]
         super().__init__(*scenes, seed)
+        self._check_out_of_frame(scenes[0])
         # Numbers in the cube's own coordinates would be stretched: the world's are wanted.
         self._stretch = box
         off = self.rng.uniform(-0.25, 0.25, 3)
         self.optimizer["where"] = mi.Point3f(*(np.array(self.where) + off).tolist())
         self.optimizer["turn"] = mi.Float(np.radians(self.turn + self.rng.uniform(-25, 25)))
+
+    @staticmethod
+    def _check_out_of_frame(scene: dict[str, Any]) -> None:
+        seen = {**scene, "integrator": {**scene["integrator"], "max_depth": 1, "aovs": "opacity"}}
+        if np.array(mi.render(mi.load_dict(seen), spp=64, seed=1))[..., -1].max() > 0:
+            raise SystemExit("recover: the object of problem 'pose' is in the frame")
 
     def apply(self) -> None:
         where, turn = self.optimizer["where"], self.optimizer["turn"]
