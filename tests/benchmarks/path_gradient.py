@@ -150,7 +150,7 @@ def _time(name: str, medium: dict[str, Any], options: argparse.Namespace) -> Row
 
 def _memory(depth: int, spp: int, options: argparse.Namespace) -> Row:
     command = [sys.executable, "-m", "tests.benchmarks.path_gradient"]
-    command += ["--size", str(options.size), "--case", str(depth), str(spp)]
+    command += ["--size", str(2 * options.size), "--case", str(depth), str(spp)]
     done = subprocess.run(command, check=True, capture_output=True, text=True)
     peak = float(done.stdout.split()[-2])
     print(f"depth {depth}, {spp} samples a pixel: peak {peak:.0f} MB", flush=True)
