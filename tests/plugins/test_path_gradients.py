@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -354,6 +356,17 @@ def test_a_derivative_compiles_nothing_after_the_first_ones() -> None:
         slopes.backward(3, 2)
         kernels = dr.kernel_history()
     assert len(kernels) > 50 and not [k for k in kernels if k.get("cache_hit") == 0]
+
+
+@pytest.mark.slow
+def test_memory_grows_neither_with_depth_nor_with_samples() -> None:
+    """Peaks of processes that do one backward pass, in passes of the same number of rays."""
+    command = [sys.executable, "-m", "tests.benchmarks.path_gradient", "--size", "64", "--case"]
+    peaks = []
+    for case in (("2", "4"), ("16", "4"), ("2", "64")):
+        done = subprocess.run([*command, *case], check=True, capture_output=True, text=True)
+        peaks.append(float(done.stdout.split()[-2]))
+    assert max(peaks[1:]) < 1.3 * peaks[0], peaks
 
 
 # ---- What has none --------------------------------------------------------------
