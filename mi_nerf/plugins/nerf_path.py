@@ -98,7 +98,16 @@ class NerfPathIntegrator(MarchingIntegrator):
     not additive along the ray: a surface within such a field splits it, and both parts decoded
     on their own differ a little from the whole decoded at once.
 
-    There are no derivatives; :monosp:`nerf` has them.
+    **Derivatives**, backward and forward, by path replay (Vicini et al. 2021,
+    :py:mod:`mi_nerf.plugins.path_replay`): of weights and places of fields, of colours and
+    textures of surfaces and of the power of lights; through shadows, mirrors, glass and the light
+    that fields cast. Memory grows neither with the depth of paths nor with their number. Sampling
+    is detached. As in :monosp:`prb`, edges of surfaces that move are left out; here surfaces,
+    sensors and the positions of lights have no derivatives at all, and asking for one is an
+    error. Left out, too: a channel of colour that is exactly 0, as to what is reflected more
+    than once; mirrors or glass within :monosp:`blendbsdf`; and the alpha channel, as to fields
+    behind surfaces that let light straight through. Russian roulette and ``stop`` apply to
+    derivatives as they do to pictures.
 
     .. tabs::
         .. code-tab:: xml
@@ -116,6 +125,7 @@ class NerfPathIntegrator(MarchingIntegrator):
     plugin = "nerf_path"
     differentiable = True
     rays_per_pass = 1 << 20  # paths remember more than rays do
+    rays_per_adjoint = 1 << (18 if mi.variant().startswith("cuda") else 14)  # and more to go back
 
     def __init__(self, props: mi.Properties) -> None:
         # Checked before the base class reads and refuses them.
