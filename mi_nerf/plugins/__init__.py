@@ -28,7 +28,8 @@ Backwards, from a gradient of the image to parameters (``nerf``)::
           march.query.Evaluation.backward         block by block: to the network's weights
           crossing.Moving.backward                to the pose of medium and cube
 
-``nerf_path`` has another backdrop (paths.py), ``nerf_tracking`` another estimate of the integral.
+``nerf_path`` has another backdrop (paths.py), whose derivatives follow the same paths once more
+(path_replay.py, path_derivatives.py); ``nerf_tracking`` has another estimate of the integral.
 Where media of Mitsuba's own stand beside the fields, the scene is another one (fog_scene.py).
 
 Plugin classes inherit from classes of the active Mitsuba variant, so the modules that define them

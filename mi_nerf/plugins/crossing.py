@@ -83,6 +83,16 @@ class Crossing:
             self.moving.forward()
             self.evaluation.forward()
 
+    def optical_depth(self) -> Any:
+        """Along the whole of each ray; differentiable as :meth:`prepare` has it."""
+        return dr.block_sum(self.evaluation.density * self.samples.delta, self.samples.count)
+
+    def backward(self) -> None:
+        """Carries the gradients of the field's answers and places to what they depend on."""
+        if self.differentiable:
+            self.evaluation.backward()
+            self.moving.backward()
+
     def layer(self) -> Layer:
         """What is merged with other fields."""
         edges = self.samples.edges() if self._edges is None else self._edges

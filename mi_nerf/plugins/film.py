@@ -254,7 +254,8 @@ class FieldIntegrator(ADIntegrator):
         self._require_thawed()
         if not self.differentiable:
             raise InputError(
-                f"{self.plugin}: has no derivatives, expected the integrator 'nerf' for them"
+                f"{self.plugin}: has no derivatives, expected the integrator 'nerf' or "
+                "'nerf_path' for them"
             )
 
     def _require_thawed(self) -> None:

@@ -115,8 +115,7 @@ def transmittance(fields: list[SampledField], rays: Rays) -> Any:
 def _optical_depth(marched: SampledField, rays: Rays) -> Any:
     """Of one field along rays that cross it."""
     (crossing,) = crossings([marched], rays, dr.ADMode.Primal, emission=False)
-    samples, density = crossing.samples, crossing.evaluation.density
-    return dr.block_sum(density * samples.delta, samples.count)
+    return crossing.optical_depth()
 
 
 class Integral:
@@ -155,9 +154,7 @@ class Integral:
                 dr.enqueue(dr.ADMode.Backward, value)
             dr.traverse(dr.ADMode.Backward)
             for crossing in self._crossings:
-                if crossing.differentiable:
-                    crossing.evaluation.backward()
-                    crossing.moving.backward()
+                crossing.backward()
 
     def forward(self) -> list[Any]:
         """The derivatives of ``values`` along the gradients of weights and places."""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
 import mitsuba as mi
 
 from .field_scene import FieldScene
@@ -10,6 +14,7 @@ from .path_state import PathSettings
 from .paths import PathsBehind
 from .placement import find_fields
 from .solid_scene import SolidScene, check_no_loose_field
+from .wanted_gradients import check_gradients
 
 
 class NerfPathIntegrator(MarchingIntegrator):
@@ -93,7 +98,16 @@ class NerfPathIntegrator(MarchingIntegrator):
     not additive along the ray: a surface within such a field splits it, and both parts decoded
     on their own differ a little from the whole decoded at once.
 
-    There are no derivatives; :monosp:`nerf` has them.
+    **Derivatives**, backward and forward, by path replay (Vicini et al. 2021,
+    :py:mod:`mi_nerf.plugins.path_replay`): of weights and places of fields, of colours and
+    textures of surfaces and of the power of lights; through shadows, mirrors, glass and the light
+    that fields cast. Memory grows neither with the depth of paths nor with their number. Sampling
+    is detached. As in :monosp:`prb`, edges of surfaces that move are left out; here surfaces,
+    sensors and the positions of lights have no derivatives at all, and asking for one is an
+    error. Left out, too: a channel of colour that is exactly 0, as to what is reflected more
+    than once; mirrors or glass within :monosp:`blendbsdf`; and the alpha channel, as to fields
+    behind surfaces that let light straight through. Russian roulette and ``stop`` apply to
+    derivatives as they do to pictures.
 
     .. tabs::
         .. code-tab:: xml
@@ -109,7 +123,9 @@ class NerfPathIntegrator(MarchingIntegrator):
     """
 
     plugin = "nerf_path"
+    differentiable = True
     rays_per_pass = 1 << 20  # paths remember more than rays do
+    rays_per_adjoint = 1 << (18 if mi.variant().startswith("cuda") else 14)  # and more to go back
 
     def __init__(self, props: mi.Properties) -> None:
         # Checked before the base class reads and refuses them.
@@ -119,7 +135,28 @@ class NerfPathIntegrator(MarchingIntegrator):
         if props.get("max_depth", -1) < 0:  # the base class has a default of its own
             self.max_depth = _UNLIMITED
         self.sample_fields = bool(props.get("sample_fields", False))
-        self._solid = SolidScene()
+        self._solid, self._keep = SolidScene(), False
+
+    def render_backward(self, scene: mi.Scene, *args: Any, **options: Any) -> None:
+        """Carries the gradient of an image to the parameters; see :class:`FieldIntegrator`."""
+        check_gradients(scene, self.plugin)
+        with self._differentiating():
+            super().render_backward(scene, *args, **options)
+
+    def render_forward(self, scene: mi.Scene, *args: Any, **options: Any) -> Any:
+        """The derivative of an image along the gradients of the scene's parameters."""
+        check_gradients(scene, self.plugin)
+        with self._differentiating():
+            return super().render_forward(scene, *args, **options)
+
+    @contextmanager
+    def _differentiating(self) -> Iterator[None]:
+        """Scenes keep what derivatives need."""
+        self._keep = True
+        try:
+            yield
+        finally:
+            self._keep = False
 
     def to_string(self) -> str:
         """Lists the settings."""
@@ -147,6 +184,7 @@ class NerfPathIntegrator(MarchingIntegrator):
             sample_fields=self.sample_fields,
             jitter=self.jitter,
             stop=min((field.march.stop for field in fields), default=0.0),
+            keep=self._keep,
         )
         solid = self._solid.of(scene)
         return FieldScene(fields, PathsBehind(solid, fields, settings, normals), normals)

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from .colors import Spectrum
 from .sampled import Rays
 
 
@@ -22,14 +23,18 @@ class PathSettings:
     sample_fields: bool  # as light sources
     jitter: bool  # of the samples on segments
     stop: float  # what fields must let pass for a path to go on
+    keep: bool = False  # what each path brings, for derivatives
 
 
-@dataclass
 class Image:
-    """What R camera rays have gathered so far."""
+    """What R camera rays gather; told of all that brings them light, path by path."""
 
-    radiance: Any
-    alpha: Any
+    every_connection = False  # whether also those matter that bring no light just now
+
+    def __init__(self, rays: int) -> None:
+        self.radiance = dr.zeros(Spectrum, rays)
+        self.alpha = dr.zeros(mi.Float, rays)
+        dr.make_opaque(self.radiance, self.alpha)
 
     def add(self, slot: Any, radiance: Any) -> None:
         """Adds to some of the rays, each named once."""
@@ -38,6 +43,24 @@ class Image:
     def cover(self, slot: Any, alpha: Any) -> None:
         """Makes some of the rays more opaque."""
         dr.scatter_add(self.alpha, alpha, slot)
+
+    def evaluate(self) -> None:
+        """Computes what is pending."""
+        dr.eval(self.radiance, self.alpha)
+
+    def passed(self, slot: Any, rays: Rays, weight: Any, through: Any) -> None:
+        """Paths have passed fields, whose light counts by ``weight``, and all that follows
+        by ``through``, the share that they let pass; both were added."""
+
+    def lit(self, slot: Any, rays: Rays, light: Any, through: Any) -> None:
+        """The light of emitters has passed fields: ``light · through`` was added."""
+
+    def shone_upon(self, slot: Any, rays: Rays, weight: Any) -> None:
+        """The light of fields, times ``weight``, was added."""
+
+    def left(self, vertex: Vertex) -> None:
+        """All light that reaches paths at a surface was added; what follows comes with the
+        next segment."""
 
 
 @dataclass
@@ -54,6 +77,7 @@ class Paths:
     pdf: Any  # of its direction, by the surface's BSDF
     delta: Any  # whether that has no density: emitters and fields cannot be sampled so
     wavelengths: Any  # in spectral variants
+    straight: Any  # whether the surface has let it through without a turn
 
     def take(self, index: Any) -> Any:
         """Some of them."""
@@ -76,11 +100,12 @@ class Connections:
 
     ray: Any
     reach: Any  # where they end, one number or N
-    light: Any  # what arrives, or by what the light there is weighed; 0 where there is none
+    light: Any  # what arrives, or by what the light there is weighed
+    wanted: Any  # N: which of them matter
 
     def take(self, jitter: Any) -> tuple[Any, Rays, Any]:
-        """Those that bring anything: their numbers, the rays, and ``light``."""
-        lit = mi.UInt32(dr.compress(dr.max(self.light) > 0))
+        """Those that matter: their numbers, the rays, and ``light``."""
+        lit = mi.UInt32(dr.compress(self.wanted))
         reach = self.reach if len(self.reach) == 1 else gather(self.reach, lit)
         o, d, light = (gather(v, lit) for v in (self.ray.o, self.ray.d, self.light))
         wavelengths = gather(self.ray.wavelengths, lit)
@@ -107,6 +132,20 @@ class Chance:
         kept = {name: gather(getattr(self, name), index) for name in names}
         jitter = [None if v is None else gather(v, index) for v in self.jitter]
         return Chance(**kept, jitter=jitter)
+
+
+@dataclass
+class Vertex:
+    """N paths at the surfaces, or the sky, that they have met, and what came of it."""
+
+    paths: Paths  # as they arrived
+    ends: Ends
+    depth: int  # of the segments that end here, from 0
+    chance: Chance
+    following: Paths | None = None  # as they went on; None at the end of the longest paths
+    going: Any = None  # which of them did
+    through: Any = None  # N: what fields let pass of the light of the emitter that was chosen
+    shone: Any = None  # N colours: what fields sent from the direction that was chosen; or None
 
 
 def gather(value: Any, index: Any) -> Any:

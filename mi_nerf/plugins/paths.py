@@ -11,13 +11,23 @@ import mitsuba as mi
 from mitsuba.python.ad.integrators.common import mis_weight
 
 from .backdrop import Backdrop, Hit, Light
-from .colors import Spectrum, unpolarized
+from .colors import Spectrum
 from .field_light import FieldLight
 from .integral import see, transmittance
-from .path_state import Chance, Connections, Ends, Image, Paths, PathSettings, gather
+from .path_derivatives import Derivatives, Pull, Push
+from .path_replay import Colors, Replay
+from .path_state import (
+    Chance,
+    Connections,
+    Ends,
+    Image,
+    Paths,
+    PathSettings,
+    Vertex,
+    gather,
+)
 from .sampled import Rays, SampledField
-
-_MOST_SURVIVE = 0.95  # of a wavefront in Russian roulette, as in Mitsuba's path tracer
+from .vertex import Surroundings
 
 
 @dataclass(frozen=True)
@@ -27,12 +37,22 @@ class PathHit(Hit):
     ends: Any = None  # an :class:`Ends`
 
 
+@dataclass(frozen=True)
+class Followed:
+    """What replays one path for each of R camera rays."""
+
+    first: Ends
+    slot: Any  # the camera rays that were followed
+    radiance: Any  # R colours: what the paths have brought
+
+
 class PathsBehind(Backdrop):
     """The scene's surfaces and lights, seen by paths that fields weaken and brighten.
 
     A path tracer like Mitsuba's :monosp:`path`, bounce by bounce in wavefronts: fields are
     asked in blocks, which no recorded loop can hold. Paths that have ended are left out of
-    the next wavefront.
+    the next wavefront. Derivatives follow the same paths once more
+    (:mod:`mi_nerf.plugins.path_replay`).
     """
 
     def __init__(
@@ -50,7 +70,8 @@ class PathsBehind(Backdrop):
         """
         self._scene, self._settings, self._normals = scene, settings, normals
         self._fields = [field.unbounded() for field in marched]
-        self._light = FieldLight(self._fields if settings.sample_fields else [])
+        lights = FieldLight(self._fields if settings.sample_fields else [])
+        self._around = Surroundings(scene, settings, lights)
 
     # ---------------------------------- What cameras see ----------------------------------
 
@@ -69,19 +90,42 @@ class PathsBehind(Backdrop):
 
     def shade(self, hit: PathHit, ray: Any, sampler: Any, opacity: Any) -> Light:
         """The radiance from there on, on average over paths."""
-        settings, count = self._settings, dr.width(hit.distance)
-        image = Image(dr.zeros(Spectrum, count), dr.zeros(mi.Float, count))
-        dr.make_opaque(image.radiance, image.alpha)
+        settings, total, states = self._settings, Image(dr.width(hit.distance)), []
         sampler = sampler.clone()
         going = dr.compress(1 - opacity > settings.stop) if settings.max_depth else mi.UInt32()
         for _ in range(settings.paths):
-            self._follow(hit.ends, mi.UInt32(going), sampler, image)
-        radiance = list(image.radiance * (1 / settings.paths))
-        valid = dr.fmin(image.alpha * (1 / settings.paths), 1)
+            image, slot = Image(dr.width(hit.distance)), mi.UInt32(going)
+            self._follow(hit.ends, slot, sampler, image)
+            total.radiance += image.radiance
+            total.alpha += image.alpha
+            total.evaluate()
+            if settings.keep:
+                states.append(Followed(hit.ends, slot, image.radiance))
+        radiance = list(total.radiance * (1 / settings.paths))
+        valid = dr.fmin(total.alpha * (1 / settings.paths), 1)
         if not settings.hide_lights and self._scene.environment() is not None:
-            valid = dr.full(mi.Float, 1, count)  # as in Mitsuba's path tracer
+            valid = dr.full(mi.Float, 1, dr.width(hit.distance))  # as in Mitsuba's path tracer
         dr.eval(radiance, valid)
-        return Light(radiance, valid)
+        return Light(radiance, valid, states)
+
+    def backward(self, ray: Any, sampler: Any, light: Light, gradients: list[Any]) -> None:
+        """Carries gradients of the radiance to fields, surfaces and lights."""
+        gradient = Spectrum(*gradients) * (1 / self._settings.paths)
+        self._replay(sampler, light, Pull(self._fields, gradient))
+
+    def forward(self, ray: Any, sampler: Any, light: Light) -> list[Any]:
+        """The derivative of the radiance along the gradients of fields, surfaces and lights."""
+        push = Push(self._fields, len(light.valid))
+        self._replay(sampler, light, push)
+        return list(push.tangent * (1 / self._settings.paths))
+
+    def _replay(self, sampler: Any, light: Light, derivatives: Derivatives) -> None:
+        """Follows the paths that :meth:`shade` has followed, with the same random numbers."""
+        sampler = sampler.clone()
+        colors = Colors(self._around)
+        for state in light.states:
+            replay = Replay(state.radiance, colors, derivatives)
+            self._follow(state.first, state.slot, sampler, replay)
 
     def _behind_lights(self, ray: Any, pi: Any) -> tuple[Any, Any]:
         """The rays behind the light sources that they hit first, and what these meet."""
@@ -114,6 +158,7 @@ class PathsBehind(Backdrop):
             pdf=one,
             delta=dr.full(mi.Bool, True, len(slot)),
             wavelengths=ends.ray.wavelengths,
+            straight=dr.full(mi.Bool, False, len(slot)),
         )
         dr.make_opaque(paths, ends)
         for depth in itertools.count():
@@ -131,18 +176,25 @@ class PathsBehind(Backdrop):
         pi = self._scene.ray_intersect_preliminary(ray, coherent=False)
         dr.eval(ray, pi)
         if self._fields:
-            seen = see(self._fields, Rays(paths.o, paths.d, pi.t, jitter, paths.wavelengths))
-            weight = mi.Float(1)
-            if self._light.boxes:
-                pdf = self._light.pdf(paths.vertex, paths.d)
-                weight = dr.select(paths.delta, 1, mis_weight(paths.pdf, pdf))
-            image.add(paths.slot, paths.throughput * weight * seen.color)
+            rays, lights = (
+                Rays(paths.o, paths.d, pi.t, jitter, wavelengths=paths.wavelengths),
+                self._around.fields,
+            )
+            seen = see(self._fields, rays)
+            share = mi.Float(1)
+            if lights.boxes:
+                pdf = lights.pdf(paths.vertex, paths.d)
+                share = dr.select(paths.delta, 1, mis_weight(paths.pdf, pdf))
+            weight = paths.throughput * share
+            image.add(paths.slot, weight * seen.color)
             image.cover(paths.slot, paths.transmittance * seen.opacity)
             through = 1 - seen.opacity
             through = dr.select(through > dr.opaque(mi.Float, self._settings.stop), through, 0)
             paths.throughput *= through
             paths.transmittance *= through
-            dr.eval(paths, image)
+            dr.eval(paths, weight, through)
+            image.evaluate()
+            image.passed(paths.slot, rays, weight, through)
         return Ends(ray, pi)
 
     def _bounce(
@@ -153,122 +205,68 @@ class PathsBehind(Backdrop):
         Returns:
             The next segments, and which of the paths go on.
         """
-        si = ends.pi.compute_surface_interaction(ends.ray, mi.RayFlags.All)
-        bsdf = si.bsdf(ends.ray)
-        image.add(paths.slot, self._emitted(si, paths, depth))
+        around, slot = self._around, paths.slot
+        si, bsdf = around.at(ends)
+        vertex = Vertex(paths, ends, depth, chance)
+        image.add(slot, around.emitted(si, paths, depth))
         if depth + 1 >= self._settings.max_depth:
-            image.cover(paths.slot, dr.select(si.is_valid(), paths.transmittance, 0))
-            dr.eval(image)
+            image.cover(slot, dr.select(si.is_valid(), paths.transmittance, 0))
+            image.evaluate()
+            image.left(vertex)
             return paths, mi.Bool(False)
         active = si.is_valid() & (dr.max(paths.throughput) > 0)
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        from_emitters = self._to_emitters(si, bsdf, paths, chance, smooth)
-        from_fields = self._to_fields(si, bsdf, paths, chance, smooth)
-        following, going = self._turn(si, bsdf, paths, depth, chance, active)
-        image.cover(
-            paths.slot, dr.select(si.is_valid(), paths.transmittance - following.transmittance, 0)
-        )
-        dr.eval(image, from_emitters, from_fields, following, going)
-        self._add_emitters(from_emitters, paths.slot, chance.jitter[0], image)
-        self._add_fields(from_fields, paths.slot, chance.jitter[1], image)
-        return following, going
-
-    def _emitted(self, si: Any, paths: Paths, depth: int) -> Any:
-        """What the surfaces that were hit, or the sky, emit towards the paths."""
-        before = dr.zeros(mi.Interaction3f)
-        before.p = paths.vertex
-        ds = mi.DirectionSample3f(self._scene, si, before)
-        pdf = self._scene.pdf_emitter_direction(before, ds, ~paths.delta)
-        shown = si.is_valid() | mi.Bool(depth > 0 or not self._settings.hide_lights)
-        emitted = unpolarized(ds.emitter.eval(si, shown))
-        return paths.throughput * mis_weight(paths.pdf, pdf) * emitted
-
-    def _to_emitters(
-        self, si: Any, bsdf: Any, paths: Paths, chance: Chance, active: Any
-    ) -> Connections:
-        """Towards light sources: what they would bring if no field were between."""
-        ds, weight = self._scene.sample_emitter_direction(si, chance.emitter, True, active)
-        active = active & (ds.pdf != 0)
-        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
-        weight = unpolarized(weight) * dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-        light = dr.select(active, paths.throughput * unpolarized(value) * weight, 0)
-        # Of emitters at infinity the scene says a distance, within which not all fields lie.
-        infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        return Connections(
-            mi.Ray3f(si.p, ds.d, 0, si.wavelengths), dr.select(infinite, dr.inf, ds.dist), light
-        )
-
-    def _to_fields(
-        self, si: Any, bsdf: Any, paths: Paths, chance: Chance, active: Any
-    ) -> Connections | None:
-        """Towards fields: by what the light that comes from there counts."""
-        if not self._light.boxes:
-            return None
-        d = self._light.sample(si.p, chance.field, chance.field_point)
-        density = self._light.pdf(si.p, d)
-        active = active & (density > 0)
-        value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(d), active)
-        weight = mis_weight(density, pdf) / dr.select(active, density, 1)
-        light = dr.select(active, paths.throughput * unpolarized(value) * weight, 0)
-        return Connections(si.spawn_ray(d), mi.Float(dr.inf), light)
-
-    def _turn(
-        self, si: Any, bsdf: Any, paths: Paths, depth: int, chance: Chance, active: Any
-    ) -> tuple[Paths, Any]:
-        """The segments after the surface, and which paths go on with them."""
-        sample, weight = bsdf.sample(
-            mi.BSDFContext(), si, chance.bsdf_component, chance.bsdf, active
-        )
-        ray = si.spawn_ray(si.to_world(sample.wo))
-        throughput, eta = paths.throughput * unpolarized(weight), paths.eta * sample.eta
-        strongest = dr.max(throughput)
-        going = active & (strongest > 0)
-        if depth + 1 >= self._settings.rr_depth:
-            # Less often where refraction has only spread the light out.
-            survival = dr.fmin(strongest * dr.square(eta), _MOST_SURVIVE)
-            going &= chance.roulette < survival
-            throughput /= dr.select(going, survival, 1)
-        straight = active & mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
-        following = Paths(
-            slot=paths.slot,
-            o=ray.o,
-            d=ray.d,
-            throughput=throughput,
-            eta=eta,
-            transmittance=dr.select(straight, paths.transmittance, 0),
-            vertex=si.p,
-            pdf=sample.pdf,
-            delta=mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta),
-            wavelengths=paths.wavelengths,
-        )
+        every = image.every_connection
+        emitters = around.to_emitters(si, bsdf, paths, chance, smooth, every=every)
+        fields = around.to_fields(si, bsdf, paths, chance, smooth, every=every)
+        following, going = around.turn(si, bsdf, paths, depth, chance, active)
+        covered = paths.transmittance - following.transmittance
+        image.cover(slot, dr.select(si.is_valid(), covered, 0))
+        dr.eval(emitters, fields, following, going)
+        image.evaluate()
+        vertex.following, vertex.going = following, going
+        vertex.through = self._add_emitters(emitters, slot, chance.jitter[0], image)
+        vertex.shone = self._add_fields(fields, slot, chance.jitter[1], image)
+        image.left(vertex)
         return following, going
 
     # ---------------------------------- Connections ----------------------------------
 
-    def _add_emitters(self, connections: Connections, slot: Any, jitter: Any, image: Image) -> None:
-        """Adds the light of emitters, weakened by the fields before them."""
+    def _add_emitters(self, connections: Connections, slot: Any, jitter: Any, image: Image) -> Any:
+        """Adds the light of emitters; returns what the fields before them let pass, N values."""
         lit, rays, light = connections.take(jitter)
+        passing = dr.zeros(mi.Float, len(slot))
         if not len(lit):
-            return
-        if self._fields:
-            light *= transmittance(self._fields, rays)
-        image.add(gather(slot, lit), light)
-        dr.eval(image)
+            return passing
+        through = transmittance(self._fields, rays) if self._fields else dr.ones(mi.Float, len(lit))
+        slot = gather(slot, lit)
+        image.add(slot, light * through)
+        dr.scatter(passing, through, lit)
+        dr.eval(passing, through, slot)
+        image.evaluate()
+        image.lit(slot, rays, light, through)
+        return passing
 
     def _add_fields(
         self, connections: Connections | None, slot: Any, jitter: Any, image: Image
-    ) -> None:
-        """Adds the light of fields before the first surface."""
+    ) -> Any:
+        """Adds the light of fields before the first surface; returns it, N colours, if any."""
         if connections is None:
-            return
-        lit, rays, light = connections.take(jitter)
+            return None
+        lit, rays, weight = connections.take(jitter)
+        shone = dr.zeros(Spectrum, len(slot))
         if not len(lit):
-            return
+            return shone
         first = mi.Ray3f(rays.o, rays.d)
         rays.reach = self._scene.ray_intersect_preliminary(first, coherent=False).t
         dr.eval(rays.reach)
-        image.add(gather(slot, lit), light * see(self._fields, rays).color)
-        dr.eval(image)
+        color, slot = see(self._fields, rays).color, gather(slot, lit)
+        image.add(slot, weight * color)
+        dr.scatter(shone, color, lit)
+        dr.eval(shone, slot)
+        image.evaluate()
+        image.shone_upon(slot, rays, weight)
+        return shone
 
     def _chance(self, sampler: Any, slot: Any) -> Chance:
         """Draws for all R camera rays, so that the sampler keeps its order; N are kept."""

@@ -68,10 +68,12 @@ class SampledField:
         near = mi.Float(march.near or 0) if self.near is None else self.near * scale
         far = mi.Float(dr.inf if march.far is None else march.far)
         if self.far is not None:
-            far = self.far * scale
+            far = self.far * scale if self.far < math.inf else mi.Float(dr.inf)
         if start is not None:
             near = dr.fmax(near, start * scale)
-        return near, dr.fmin(far, reach * scale)
+        # Infinity times a scale has no derivative.
+        ends = reach < dr.inf
+        return near, dr.fmin(far, dr.select(ends, dr.select(ends, reach, 0) * scale, dr.inf))
 
     def hit(self, rays: Rays) -> Any:
         """Which rays cross the box within their bounds."""

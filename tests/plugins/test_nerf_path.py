@@ -465,12 +465,3 @@ def test_bad_settings(options: dict[str, Any], message: str) -> None:
 def test_it_cannot_be_nested() -> None:
     said = refused(integrator=nerf("nerf_path"), box=slab(place(), 1.0, GLOW))
     assert "'nerf_path' nested in 'nerf', expected one like 'path'" in said
-
-
-def test_gradients_are_refused() -> None:
-    scene = mi.load_dict(scene_of(paths(), field=slab(place(), 1.0, GLOW)))
-    params = mi.traverse(scene)
-    dr.enable_grad(params["field.interior_medium.density"])
-    params.update()
-    with pytest.raises(mi_nerf.InputError, match="nerf_path: has no derivatives"):
-        dr.backward(mi.render(scene, params))
