@@ -35,7 +35,7 @@ MOST_CHANGED = 1.0  # dB that the mean of directions in their place may cost at 
 # the steps, 0.02 L² to 0.06 L² were left at the end: Lego (100×100, 900 steps) 0.72 and 2.1 dB,
 # 0.03 and 0.20 at the end; arches (600 steps) 1.9 and 3.3 dB, 0.08 and 0.20.
 AT_ONCE = 0.6
-ASKED = (0.2, 0.35, 0.5)  # shares of the budget after which views held back are asked,
+ASKED = (0.2, 0.3, 0.4, 0.5)  # shares of the budget after which views held back are asked,
 ASKED_STEPS = 200  # no earlier than after so many steps,
 APART = 50  # nor sooner than so many after the last time
 TRIAL = 0.03  # share of the budget for which something new is trained before it is judged,
