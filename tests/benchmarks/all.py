@@ -72,6 +72,8 @@ PLAN = (
     Task(4, "tests.benchmarks.generate"),
     Task(4, "tests.benchmarks.inverse_loop"),
     Task(4, "tests.benchmarks.native"),
+    Task(2, "tests.benchmarks.path_gradient"),
+    Task(10, "tests.benchmarks.recover"),
     Task(12, "tests.benchmarks.reduced_paper"),
     Task(15, "tests.benchmarks.robustness --out runs/robustness --set collapse_check=150"),
     Task(140, "tests.benchmarks.resolution --seconds 3600", compares=True),
