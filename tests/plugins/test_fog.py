@@ -24,6 +24,8 @@ from tests.support.composed import (
     scene_of,
     slab,
 )
+from tests.support.variants import EVERY
+from tests.support.variants import variant as variant_of
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -163,6 +165,70 @@ def test_light_that_fog_scatters_agrees_with_volpath(banks: list[float], uneven:
     )
     check(one - two, floor=2e-3)
     assert np.abs((one - three).mean(axis=0)).max() > 0.05  # the field matters
+
+
+# ---- Other variants --------------------------------------------------------------
+
+LUMINANCE = np.array([0.212671, 0.715160, 0.072169])
+
+
+def grey(scene: dict[str, Any]) -> dict[str, Any]:
+    """The same with fog that weakens all colours alike: a spectrum does not change what is left."""
+    for part in scene.values():
+        if isinstance(part, dict) and part.get("interior", {}).get("type") == "homogeneous":
+            part["interior"] |= {"sigma_t": rgb([0.4] * 3)}
+    return scene
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [p for p in EVERY if "_mono" in str(p) or "_spectral" in str(p)])
+def test_colors_of_other_variants(name: str) -> None:
+    """Grey fog before and behind fields, against the closed form: means of pictures."""
+    with variant_of(name):
+        integrator = nerf("volpath", samples=4, paths=16, jitter=False)
+        scene, errors = mi.load_dict(grey(layered("fog, field, fog", integrator))), []
+        for seed in range(16):
+            rays = camera_rays(scene, seed)
+            expected = closed_form(*rays, layers_of("fog, field, fog"), np.full(3, 0.8))
+            expected = expected if "_spectral" in name else (expected @ LUMINANCE)[:, None]
+            found = render(scene, seed=seed)[..., : expected.shape[-1]]
+            error = found - expected.reshape(found.shape)
+            errors.append(error.mean(axis=(0, 1)))
+    bound = 4 * np.std(errors, axis=0, ddof=1) / 4 + 5e-4 * expected.mean()
+    assert (np.abs(np.mean(errors, axis=0)) < bound).all()
+    assert (bound < 0.08 * expected.mean(axis=0)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["llvm_ad_mono", "llvm_ad_spectral"])
+def test_derivatives_in_other_variants(name: str) -> None:
+    """By the field's density and colour, in fog, against finite differences."""
+    with variant_of(name):
+        nested = nerf("prbvolpath", samples=4, paths=1, jitter=False)
+        scene = mi.load_dict(grey(layered("fog, field, fog", nested)))
+        params = mi.traverse(scene)
+        keys = [f"part_1.interior_medium.{key}" for key in ("density", "radiance")]
+        options = {"spp": 4, "seed": 5}
+        image = np.array(mi.render(scene, **options))
+        pull = np.random.default_rng(0).random(image.shape)
+        expected = []
+        for key in keys:
+            start, sums = np.array(params[key], np.float32), []
+            for step in (1e-2, -1e-2, 0):
+                moved = start.copy()
+                moved.flat[0] += step
+                params[key] = type(params[key])(moved)
+                params.update()
+                sums.append(float((render(scene, **options) * pull).sum()))
+            expected.append((sums[0] - sums[1]) / 2e-2)
+        for key in keys:
+            dr.enable_grad(params[key])
+        params.update()
+        pull_in = mi.TensorXf(pull.astype(np.float32))
+        scene.integrator().render_backward(scene, params, pull_in, **options)
+        found = [np.array(dr.grad(params[key])).flat[0] for key in keys]
+        np.testing.assert_allclose(found, expected, rtol=1e-2)
+        assert np.abs(expected).min() > 0.1
 
 
 # ---- Derivatives -----------------------------------------------------------------
