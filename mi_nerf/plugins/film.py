@@ -310,6 +310,8 @@ class FieldIntegrator(ADIntegrator):
             pass_seed = seed if i == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(i))[0]
             sampler, _ = self.prepare(sensor, pass_seed, count, self.aov_names())
             ray, weight, position = self.sample_rays(scene, sensor, sampler)
+            width = dr.width(position)  # a radiance meter has one ray for all
+            ray.o, ray.d = ray.o + dr.zeros(mi.Float, width), ray.d + dr.zeros(mi.Float, width)
             random = self._draw(sampler, dr.width(ray), pass_seed)
             dr.eval(ray, weight, position, random)
             sampler.schedule_state()
