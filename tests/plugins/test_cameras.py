@@ -1,4 +1,8 @@
-"""Sensors and films of Mitsuba's own, through every integrator that shows fields."""
+"""Sensors and films of Mitsuba's own, through every integrator that shows fields.
+
+Before test_native_loop.py, by name: Mitsuba's ``batch`` traces every sensor that there is, and
+those of a RayDataLoader, even of one that is gone, fail in it (Mitsuba 3.9.1).
+"""
 
 from __future__ import annotations
 
