@@ -18,7 +18,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..base.arrays import Floats, Indices, Mask, Vectors, vector3_type
+from ..base.arrays import Floats, Indices, Mask, Vectors, taken, vector3_type
 from .intervals import RaySegments
 from .occupancy import OccupancyGrid
 from .path import Path
@@ -94,7 +94,7 @@ class Waves:
         slot = uint(dr.compress(stratum != _NONE))
         own = dr.gather(uint, ray, slot >> shift)
         _, p = self._path(own).at(dr.gather(uint, stratum, slot))
-        answers = ask(p, _taken(self._within.view, own))
+        answers = ask(p, _vectors_of(self._within.view, own))
         return self._add(ray, shift, stratum, number, beyond, answers)
 
     def _find(self, ray: Indices, size: int, shift: Indices) -> tuple[Indices, Indices, Indices]:
@@ -158,10 +158,10 @@ class Waves:
         """The strata of some rays, or of all."""
         within, jitter = self._within, self._jitter
         if ray is not None:
-            near, far = (_taken_values(v, ray) for v in (within.near, within.far))
-            o, d = _taken(within.o, ray), _taken(within.d, ray)
+            near, far = (taken(v, ray) for v in (within.near, within.far))
+            o, d = _vectors_of(within.o, ray), _vectors_of(within.d, ray)
             within = replace(within, o=o, d=d, near=near, far=far)
-            jitter = None if jitter is None else _taken_values(jitter, ray)
+            jitter = None if jitter is None else taken(jitter, ray)
         return Path(within, self._samples, jitter, self._grid)
 
 
@@ -173,12 +173,7 @@ def _binary_logarithm(rays: int) -> int:
     return size.bit_length() - 1
 
 
-def _taken(vectors: Vectors, ray: Indices) -> Vectors:
+def _vectors_of(vectors: Vectors, ray: Indices) -> Vectors:
     """Of each of some rays."""
-    values = [_taken_values(vectors[i], ray) for i in range(3)]
+    values = [taken(vectors[i], ray) for i in range(3)]
     return vector3_type(type(values[0]))(*values)
-
-
-def _taken_values(values: Floats, ray: Indices) -> Floats:
-    """Of each of some rays; a single value is that of all."""
-    return values if len(values) == 1 else dr.gather(type(values), values, ray)

@@ -8,6 +8,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..base.arrays import taken
 from .colors import Spectrum
 from .sampled import Rays
 
@@ -106,7 +107,7 @@ class Connections:
     def take(self, jitter: Any) -> tuple[Any, Rays, Any]:
         """Those that matter: their numbers, the rays, and ``light``."""
         lit = mi.UInt32(dr.compress(self.wanted))
-        reach = self.reach if len(self.reach) == 1 else gather(self.reach, lit)
+        reach = taken(self.reach, lit)
         o, d, light = (gather(v, lit) for v in (self.ray.o, self.ray.d, self.light))
         wavelengths = gather(self.ray.wavelengths, lit)
         jitter = None if jitter is None else gather(jitter, lit)

@@ -42,7 +42,6 @@ from .run_folder import (
     LOG,
     cut_log,
     read_config,
-    read_record,
 )
 from .scaling import summary
 from .schedule import learning_rate
@@ -401,8 +400,9 @@ def start(
     folder = Path(out)
     clock = time.monotonic() if started is None else started
     recorded = resume and (folder / CONFIG).exists()
+    record: dict[str, Any] = {}
     if recorded:
-        config = _resumed_config(folder, config, data)
+        config, record = _resumed_config(folder, config, data)
     elif resume and (folder / CHECKPOINT).exists():
         raise InputError(f"{folder}: no {CONFIG} beside the {CHECKPOINT}, expected both")
     elif (folder / CONFIG).exists() or (folder / CHECKPOINT).exists():
@@ -420,7 +420,7 @@ def start(
     choice = Choice(config, [])
     if config.preset == "auto":
         choice = (
-            Choice(config, decisions_in(read_record(folder), config))
+            Choice(config, decisions_in(record, config))
             if recorded
             else choose(config, dataset, given=given)
         )
@@ -433,16 +433,16 @@ def start(
         (folder / LOG).unlink(missing_ok=True)
     if choice.decisions:
         run.shape(dataset, choice.decisions)
-    if recorded:
-        run.keep_record(read_record(folder))
-    else:
-        run.keep_record(_record(run, dataset))
+    run.keep_record(record or _record(run, dataset))
     if started is None:
         run.pause()
     return run
 
 
-def _resumed_config(folder: Path, given: TrainConfig, data: str | Path) -> TrainConfig:
+def _resumed_config(
+    folder: Path, given: TrainConfig, data: str | Path
+) -> tuple[TrainConfig, dict[str, Any]]:
+    """The configuration to go on with, and what ``config.json`` records."""
     config, record = read_config(folder)
     recorded = record["data"]["path"]
     if Path(recorded) != Path(data).resolve():
@@ -455,7 +455,7 @@ def _resumed_config(folder: Path, given: TrainConfig, data: str | Path) -> Train
             config = replace(shaped, steps=config.steps, max_seconds=config.max_seconds)
     if given.steps is not None or given.max_seconds is not None:
         config = replace(config, steps=given.steps, max_seconds=given.max_seconds)
-    return config
+    return config, record
 
 
 def _record(run: Run, dataset: Dataset) -> dict[str, Any]:

@@ -75,7 +75,7 @@ class _Drawn:
     @property
     def rays(self) -> int:
         """How many."""
-        return len(self.batch.alpha)
+        return self.batch.rays
 
     def part(self, start: int, rays: int) -> _Drawn:
         """``rays`` of the rays, from number ``start`` on."""

@@ -11,37 +11,24 @@ where none is given. ``mi-nerf ablate --rows L=2 L=4 …`` does the same for the
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mi_nerf.base.variants import choose_variant
 from mi_nerf.data import load_dataset
 from mi_nerf.tasks.evaluate import evaluate
-from mi_nerf.training import run as training
-from mi_nerf.training.config import with_settings
 from mi_nerf.training.presets import preset
 from mi_nerf.training.scaling import resolved, resolved_octaves
 from tests.benchmarks import data_folder
-from tests.benchmarks.results import TRAINING, Figure, Protocol, Row, add_options, mean_of, save
+from tests.benchmarks.results import TRAINING, Figure, Protocol, Row, mean_of, save
+from tests.benchmarks.trained import for_steps, options_of_steps
 
 
 def main() -> None:
     """Trains scene by scene."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", nargs="+", default=["lego_200"])
-    parser.add_argument("--split", default="val")
-    parser.add_argument("--views", type=int, help="evaluate so many views, evenly spread")
-    parser.add_argument("--downscale", type=int, default=1)
+    parser = options_of_steps(__doc__, 400)
     parser.add_argument("--octaves", type=int, nargs="+", default=[2, 4, 6, 8, 10])
-    parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--seeds", type=int, default=1, help="how many")
-    parser.add_argument("--set", nargs="*", default=[])
-    add_options(parser)
     options = parser.parse_args()
     rows = [_row(data_folder(name), options) for name in options.data]
     for row in rows:
@@ -77,16 +64,11 @@ def _row(data: Path, options: argparse.Namespace) -> Row:
 
 def _quality(data: Path, octaves: int, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     """What ``mi-nerf eval`` says of one run."""
-    settings = [*options.set, f"position.frequencies={octaves}"]
-    config = replace(with_settings(preset("nerf"), settings), steps=options.steps, seed=seed)
-    config = replace(config, downscale=options.downscale)
-    variant = choose_variant()
+    settings, variant = [f"position.frequencies={octaves}"], choose_variant()
     with tempfile.TemporaryDirectory() as out:
-        run = training.start(data, Path(out) / "run", config, variant)
-        run.train(show_bar=False)
-        if run.interrupted:
-            sys.exit("interrupted: nothing is written")
-        return evaluate(Path(out) / "run", variant, split=options.split, views=options.views)
+        folder = Path(out) / "run"
+        for_steps(data, folder, "nerf", seed, options, variant, settings)
+        return evaluate(folder, variant, split=options.split, views=options.views)
 
 
 if __name__ == "__main__":

@@ -11,20 +11,17 @@ protocol and writes a row a scene to docs/results/shape.json.
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from mi_nerf.base.variants import choose_variant
 from mi_nerf.tasks.evaluate import evaluate
-from mi_nerf.training import run as training
-from mi_nerf.training.config import with_settings
-from mi_nerf.training.presets import preset
 from mi_nerf.training.run_folder import FIELD
 from tests.benchmarks import data_folder
-from tests.benchmarks.results import TRAINING, Figure, Protocol, Row, add_options, mean_of, save
+from tests.benchmarks.results import TRAINING, Figure, Protocol, Row, mean_of, save
+from tests.benchmarks.trained import for_steps, options_of_steps
 
 
 @dataclass(frozen=True)
@@ -42,18 +39,7 @@ class Outcome:
 
 def main() -> None:
     """Trains scene by scene."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--data", nargs="+", default=["lego_200"])
-    parser.add_argument("--split", default="val")
-    parser.add_argument("--views", type=int, help="evaluate so many views, evenly spread")
-    parser.add_argument("--downscale", type=int, default=1)
-    parser.add_argument("--steps", type=int, default=600)
-    parser.add_argument("--seeds", type=int, default=1, help="how many")
-    parser.add_argument("--set", nargs="*", default=[])
-    add_options(parser)
-    options = parser.parse_args()
+    options = options_of_steps(__doc__, 600).parse_args()
     for name in options.data:
         row = _row(data_folder(name), options)
         print(f"{', '.join(row.labels.values())}: {row.figures}", flush=True)
@@ -91,15 +77,11 @@ def _row(data: Path, options: argparse.Namespace) -> Row:
 
 
 def _outcome(data: Path, name: str, seed: int, options: argparse.Namespace) -> Outcome:
-    config = replace(with_settings(preset(name), options.set), steps=options.steps, seed=seed)
-    config, variant = replace(config, downscale=options.downscale), choose_variant()
+    variant = choose_variant()
     with tempfile.TemporaryDirectory() as out:
         folder = Path(out) / "run"
         before = time.process_time()
-        run = training.start(data, folder, config, variant)
-        run.train(show_bar=False)
-        if run.interrupted:
-            sys.exit("interrupted: nothing is written")
+        run = for_steps(data, folder, name, seed, options, variant)
         seconds = time.process_time() - before
         for decision in run.decisions:
             print(f"{data.name}, seed {seed}: {decision}", flush=True)

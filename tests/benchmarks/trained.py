@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mi_nerf.training import run as training
+from mi_nerf.training.config import with_settings
+from mi_nerf.training.presets import preset
 from mi_nerf.training.run_folder import LOG
-from tests.benchmarks.results import Protocol, Row, mean_of
+from tests.benchmarks.results import Protocol, Row, add_options, mean_of
 
 UNITS = {
     "psnr": "dB",
@@ -56,6 +61,41 @@ def by_command(
     ):
         subprocess.run([*program, *command], check=True, stdout=subprocess.DEVNULL)
     return outcome(run, json.loads(record.read_text()))
+
+
+def options_of_steps(description: str | None, steps: int) -> argparse.ArgumentParser:
+    """Options of a benchmark that trains on scenes for equally many steps."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--data", nargs="+", default=["lego_200"])
+    parser.add_argument("--split", default="val")
+    parser.add_argument("--views", type=int, help="evaluate so many views, evenly spread")
+    parser.add_argument("--downscale", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=steps)
+    parser.add_argument("--seeds", type=int, default=1, help="how many")
+    parser.add_argument("--set", nargs="*", default=[])
+    add_options(parser)
+    return parser
+
+
+def for_steps(
+    data: Path,
+    folder: Path,
+    name: str,
+    seed: int,
+    options: argparse.Namespace,
+    variant: str,
+    settings: Sequence[str] = (),
+) -> training.Run:
+    """Trains a preset for as many steps as the options say; ends the process if interrupted."""
+    config = with_settings(preset(name), [*options.set, *settings])
+    config = replace(config, steps=options.steps, seed=seed, downscale=options.downscale)
+    run = training.start(data, folder, config, variant)
+    run.train(show_bar=False)
+    if run.interrupted:
+        sys.exit("interrupted: nothing is written")
+    return run
 
 
 def row(

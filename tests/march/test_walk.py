@@ -209,16 +209,21 @@ def test_density_alone(ad: Any) -> None:
 # ---- Networks ---------------------------------------------------------------
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("view_dependent", [True, False])
-def test_narrow_networks(view_dependent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def scene_of_network(config: NeuralFieldConfig, view_dependent: bool) -> tuple[Any, Any, Any]:
+    """A network in a grid, and 200 rays: their origins and directions."""
     import drjit.llvm.ad as ad
 
-    config = replace(NARROW, network=replace(NARROW.network, view_dependent=view_dependent))
+    config = replace(config, network=replace(config.network, view_dependent=view_dependent))
     field = NeuralField.create(config, 5, ad.TensorXf)
     o, d = (vectors(ad, v) for v in rays_around(200, 12))
     grid = random_grid(ad, (12, 12, 12), 0.2, 13)
-    marched = MarchedField(field, MarchSettings(samples=50), grid)
+    return MarchedField(field, MarchSettings(samples=50), grid), o, d
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("view_dependent", [True, False])
+def test_narrow_networks(view_dependent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    marched, o, d = scene_of_network(NARROW, view_dependent)
     agree(marched, o, d)
     fast = render_rays(marched, o, d)
     monkeypatch.setattr(render, "can_walk", lambda _: False)
@@ -227,12 +232,12 @@ def test_narrow_networks(view_dependent: bool, monkeypatch: pytest.MonkeyPatch) 
     np.testing.assert_allclose(image(fast), image(slow), atol=1e-5)
 
 
-def test_a_second_frame_compiles_nothing() -> None:
-    """With other weights, another grid, and another number of rays; it is one large kernel."""
+def kernels_of_a_second_frame(config: NeuralFieldConfig, rays: int) -> list[dict[str, Any]]:
+    """Of 321 rays through a field with other weights and another grid, after so many rays."""
     import drjit.llvm.ad as ad
 
     def frame(rays: int, seed: int) -> list[dict[str, Any]]:
-        field = NeuralField.create(NARROW, seed, ad.TensorXf)
+        field = NeuralField.create(config, seed, ad.TensorXf)
         grid = random_grid(ad, (12, 12, 12), 0.2, seed)
         o, d = (vectors(ad, v) for v in rays_around(rays, seed))
         marched = MarchedField(field, MarchSettings(samples=50, stop=1e-3), grid)
@@ -245,8 +250,13 @@ def test_a_second_frame_compiles_nothing() -> None:
         return list(dr.kernel_history([dr.KernelType.JIT]))
 
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        frame(100, 1)
-        history = frame(321, 2)
+        frame(rays, 1)
+        return frame(321, 2)
+
+
+def test_a_second_frame_compiles_nothing() -> None:
+    """With other weights, another grid, and another number of rays; it is one large kernel."""
+    history = kernels_of_a_second_frame(NARROW, 100)
     assert not [entry for entry in history if entry["cache_hit"] == 0]
     assert sum(entry["size"] >= 321 for entry in history) <= 3  # bounds, the march, the depth
 

@@ -24,7 +24,16 @@ from mi_nerf.march.placing import place_samples
 from mi_nerf.march.render import render_rays
 from mi_nerf.march.settings import MarchSettings
 from mi_nerf.march.walk import walk_rays
-from tests.march.test_walk import BOX, NARROW, agree, image, random_grid, rays_around
+from tests.march.test_walk import (
+    BOX,
+    NARROW,
+    agree,
+    image,
+    kernels_of_a_second_frame,
+    random_grid,
+    rays_around,
+    scene_of_network,
+)
 from tests.support.analytic import AnalyticField
 from tests.support.arrays import unit, vectors
 
@@ -199,13 +208,7 @@ def test_no_rays_and_none_that_hit(ad: Any) -> None:
 @pytest.mark.parametrize("view_dependent", [True, False])
 def test_wide_networks(view_dependent: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """As by the flattened path with Dr.Jit's own matrix products."""
-    import drjit.llvm.ad as ad
-
-    config = replace(WIDE, network=replace(WIDE.network, view_dependent=view_dependent))
-    field = NeuralField.create(config, 5, ad.TensorXf)
-    o, d = (vectors(ad, v) for v in rays_around(200, 12))
-    grid = random_grid(ad, (12, 12, 12), 0.2, 13)
-    marched = MarchedField(field, MarchSettings(samples=50), grid)
+    marched, o, d = scene_of_network(WIDE, view_dependent)
     fast = render_rays(marched, o, d)
     monkeypatch.setattr(NeuralField, "_multiplies_on_host", lambda *_: False)
     monkeypatch.setattr(render, "can_walk", lambda _: False)
@@ -216,24 +219,7 @@ def test_wide_networks(view_dependent: bool, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_a_second_frame_compiles_nothing() -> None:
     """With other weights, another grid, and another number of rays and samples."""
-    import drjit.llvm.ad as ad
-
-    def frame(rays: int, seed: int) -> list[dict[str, Any]]:
-        field = NeuralField.create(WIDE, seed, ad.TensorXf)
-        grid = random_grid(ad, (12, 12, 12), 0.2, seed)
-        o, d = (vectors(ad, v) for v in rays_around(rays, seed))
-        marched = MarchedField(field, MarchSettings(samples=50, stop=1e-3), grid)
-        grid.bits()
-        dr.eval(o, d)
-        dr.sync_thread()
-        dr.kernel_history_clear()
-        render_rays(marched, o, d)
-        dr.sync_thread()
-        return list(dr.kernel_history([dr.KernelType.JIT]))
-
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        frame(200, 1)
-        history = frame(321, 2)
+    history = kernels_of_a_second_frame(WIDE, 200)
     assert not [entry for entry in history if entry["cache_hit"] == 0]
 
 
