@@ -17,7 +17,7 @@ from .base.checks import positive, valid_seed
 from .base.errors import InputError, Option
 from .base.progress_bar import progress_bar
 from .base.variants import active_variant, array_module
-from .data import Dataset
+from .data import Dataset, ImageKind
 from .formats.field_file import FieldFile
 from .training import fresh
 from .training import run as training
@@ -116,6 +116,7 @@ def start(
     max_seconds: float | None = None,
     steps: int | None = None,
     downscale: int = 1,
+    images: ImageKind | None = None,
     seed: int = 0,
     settings: Settings = (),
     resume: bool = False,
@@ -133,6 +134,8 @@ def start(
             learning rate follows. If neither is given: 600 seconds; with ``paper`` its
             200,000 steps, if they take less than a day. ``run.forecast`` says what they would.
         downscale: average images over blocks of so many pixels squared.
+        images: ``"exr"`` trains on the linear radiance beside the pictures, ``"png"`` on the
+            pictures; default: the files that the dataset names.
         seed: of initial weights, rays and samples.
         settings: any other setting by its name, ``{"network.width": 128}``, or as ``--set``
             takes them, ``["network.width=128"]``.
@@ -149,6 +152,8 @@ def start(
         preset_config(preset), seed=valid_seed(seed), downscale=positive("downscale", downscale)
     )
     config = with_settings(config, assignments)
+    if images is not None:
+        config = replace(config, images=images)
     for name, value in (("steps", steps), ("max_seconds", max_seconds)):
         if value is not None:
             config = replace(config, **{name: positive(name, value)})
@@ -255,14 +260,14 @@ def _require_same_settings(folder: Path, given: TrainConfig, assignments: list[s
     recorded, _ = read_config(folder)
     wanted = with_settings(recorded, assignments)
     usual = TrainConfig()
-    for name in ("preset", "seed", "downscale"):
+    for name in ("preset", "seed", "downscale", "images"):
         if getattr(given, name) != getattr(usual, name):
             wanted = replace(wanted, **{name: getattr(given, name)})
     wanted = replace(wanted, steps=recorded.steps, max_seconds=recorded.max_seconds)
     if wanted != recorded:
         raise InputError(
-            "{}: a resumed run keeps its settings, expected no other {}, {}, {} or {} "
+            "{}: a resumed run keeps its settings, expected no other {}, {}, {}, {} or {} "
             "than it was started with",
             folder,
-            *map(Option, ("preset", "seed", "downscale", "settings")),
+            *map(Option, ("preset", "seed", "downscale", "images", "settings")),
         )

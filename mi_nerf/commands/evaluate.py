@@ -4,19 +4,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_args
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
+from ..base.errors import InputError, Option
 from ..base.files import check_file, check_folder, make_folder, write_json
 from ..base.variants import choose_variant
-from ..tasks.evaluate import evaluate, quality
+from ..data import ImageKind
+from ..tasks.evaluate import evaluate, more_quality, quality
 from .shared import Variant, progress_bar
 
 
 @dataclass(frozen=True)
 class Eval:
     """Measures held-out views by the nerf2020 protocol: 8 bits, on white, PSNR and SSIM.
+
+    Where the data has linear radiance or exact surfaces, as from mi-nerf generate, errors of
+    these, too: docs/datasets.md defines them.
 
     Examples:
 
@@ -25,6 +30,8 @@ class Eval:
     mi-nerf eval runs/lego --split val --views 10 --json result.json --images pictures/
 
     mi-nerf eval lego.safetensors --data lego/ --downscale 2
+
+    mi-nerf eval runs/hdr --images exr
     """
 
     target: Positional[Annotated[Path, arg(metavar="TARGET")]]
@@ -39,8 +46,11 @@ class Eval:
     """Only so many views, evenly spread."""
     json: Path | None = None
     """Write the results to this file."""
-    images: Path | None = None
-    """Write the rendered views to this folder."""
+    images: UseAppendAction[tuple[str, ...]] = ()
+    """A folder: write the rendered views there. png or exr: compare with these files, pictures of 8
+    bits or linear radiance; default: those that the run was trained on. May be given for both."""
+    geometry: bool = True
+    """Compare surfaces, where the data has exact ones."""
     variant: Variant = None
 
     def run(self, _started: float) -> None:
@@ -53,8 +63,9 @@ class Eval:
 
         if self.json is not None:
             check_file(self.json)
-        if self.images is not None:
-            check_folder(self.images)
+        folder, truth = self._images()
+        if folder is not None:
+            check_folder(folder)
         with bar:
             record = evaluate(
                 self.target,
@@ -62,7 +73,9 @@ class Eval:
                 split=self.split,
                 downscale=self.downscale,
                 views=self.views,
-                images=self.images,
+                images=folder,
+                truth=truth,
+                geometry=self.geometry,
                 variant=choose_variant(self.variant),
                 on_image=show,
             )
@@ -74,3 +87,16 @@ class Eval:
             f"{record['size'][1]}: {quality(record)}, "
             f"{record['seconds_per_view']:.2f} s and {record['queries_per_ray']:.1f} queries a ray"
         )
+        for line in more_quality(record):
+            print(line)
+
+    def _images(self) -> tuple[Path | None, ImageKind | None]:
+        """The folder to write to, and the files to compare with."""
+        kinds = [kind for kind in get_args(ImageKind) if kind in self.images]
+        folders = [name for name in self.images if name not in kinds]
+        if len(kinds) > 1 or len(folders) > 1:
+            raise InputError(
+                "{}: expected one of png and exr, and one folder",
+                Option("images", tuple(self.images)),
+            )
+        return (Path(folders[0]) if folders else None), (kinds[0] if kinds else None)

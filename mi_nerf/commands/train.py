@@ -10,6 +10,7 @@ from tyro.conf import Positional, UseAppendAction, arg
 
 from ..api import start
 from ..base.variants import choose_variant
+from ..data import ImageKind
 from .shared import Variant
 
 
@@ -29,6 +30,8 @@ class Train:
 
     mi-nerf train lego/ --out runs/published --preset paper --steps 3000
 
+    mi-nerf train hdr/ --out runs/hdr --images exr
+
     mi-nerf train lego/ --out runs/lego --resume
     """
 
@@ -45,6 +48,9 @@ class Train:
     """Stop after so many steps."""
     downscale: int = 1
     """Average images over blocks of K×K pixels."""
+    images: ImageKind | None = None
+    """The files to train on: png, 8-bit pictures, or exr, the linear radiance beside them; default:
+    those that the dataset names."""
     seed: int = 0
     """Seed of initial weights, rays and samples."""
     resume: bool = False
@@ -62,6 +68,7 @@ class Train:
             max_seconds=self.max_seconds,
             steps=self.steps,
             downscale=self.downscale,
+            images=self.images,
             seed=self.seed,
             settings=self.set,
             resume=self.resume,

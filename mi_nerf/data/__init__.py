@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Literal
 
 from ..base.box import Box
 from ..base.color import ColorSpace
@@ -20,6 +21,7 @@ __all__ = [
     "Box",
     "ColorSpace",
     "Dataset",
+    "ImageKind",
     "Progress",
     "available_splits",
     "evenly_spread_indices",
@@ -28,6 +30,8 @@ __all__ = [
     "split_to_measure",
 ]
 
+ImageKind = Literal["png", "exr"]  # of the files that hold a view: 8 or 16 bits, or radiance
+
 
 def load_dataset(
     path: str | os.PathLike[str],
@@ -35,6 +39,7 @@ def load_dataset(
     *,
     downscale: int = 1,
     limit: int | None = None,
+    images: ImageKind | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
     """Reads one split of a dataset into memory.
@@ -49,6 +54,8 @@ def load_dataset(
             follow.
         limit: Reads only this many views, the ones that
             :meth:`Dataset.evenly_spread` would choose of the whole split.
+        images: ``"exr"`` reads the linear radiance beside the pictures (``r_0.exr``), ``"png"``
+            the pictures; default: the files that the dataset names.
         progress: Called as ``progress(done, total)`` after each image.
 
     Raises:
@@ -59,7 +66,11 @@ def load_dataset(
     if downscale < 1 or downscale != int(downscale):
         raise InputError(f"downscale must be a whole number, 1 or more, got {downscale}")
     reader = llff if llff.recognises(folder) else blender
-    return reader.load(folder, split, downscale=downscale, limit=limit, progress=progress)
+    if images not in (None, "png", "exr"):
+        raise InputError("{}: expected png or exr", Option("images", images))
+    return reader.load(
+        folder, split, downscale=downscale, limit=limit, images=images, progress=progress
+    )
 
 
 def available_splits(path: str | os.PathLike[str]) -> tuple[str, ...]:

@@ -15,6 +15,10 @@ A folder holds ``transforms_{split}.json`` for each split, and images::
       "aabb": [[x, y, z], [x, y, z]]     optional: the scene's box, min and max
     }
 
+With ``images="exr"`` the linear image beside each of these files is read in its place:
+``r_0.exr`` for ``r_0`` and for ``r_0.png``. Exact surfaces beside a file are known, too:
+:mod:`mi_nerf.data.surfaces`.
+
 Further keys are ignored, except those that would change the camera into one that
 this reader does not know: lens distortion and intrinsics that vary with the frame
 are errors. ``"from_mitsuba": true`` (instant-ngp) means Mitsuba's axes.
@@ -33,11 +37,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.box import Box
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..cameras.pinhole import Intrinsics
 from ..cameras.poses import is_rigid, opengl_from_mitsuba
 from ..images.read import IMAGE_SUFFIXES, Progress, read_images
 from .dataset import Dataset, evenly_spread_indices
+from .surfaces import SurfaceFiles
 
 _USUAL_SPLITS = ("train", "val", "test")
 _INTRINSIC_KEYS = ("camera_angle_x", "fl_x", "fl_y", "cx", "cy", "w", "h")
@@ -58,6 +63,7 @@ def load(
     *,
     downscale: int = 1,
     limit: int | None = None,
+    images: str | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
     """Reads one split. Arguments and errors as for :func:`mi_nerf.data.load_dataset`."""
@@ -69,21 +75,41 @@ def load(
 
     poses = np.stack([_pose(file, frame) for frame in frames])
     near, far, box = _depth_range_and_box(file, meta)
-    paths = [_image_path(file, frame) for frame in frames]
-    images = read_images(paths, downscale, progress)
+    paths = [_image_path(file, frame, images) for frame in frames]
+    stack = read_images(paths, downscale, progress)
+    width, height = stack.width, stack.height
     return Dataset(
         path=folder,
         split=split,
         names=_unique_names(folder, paths),
-        images=images.pixels,
-        color_space=images.color_space,
-        has_alpha=images.has_alpha,
+        images=stack.pixels,
+        color_space=stack.color_space,
+        has_alpha=stack.has_alpha,
         cam_to_world=opengl_from_mitsuba(poses) if meta.get("from_mitsuba") else poses,
-        intrinsics=_intrinsics(file, meta, images.width, images.height).downscale(downscale),
+        intrinsics=_intrinsics(file, meta, width, height).downscale(downscale),
         near=near,
         far=far,
         box=box,
+        surface_files=tuple(SurfaceFiles.beside(p, width, height, downscale) for p in paths),
     )
+
+
+def views_of(folder: Path, images: str | None) -> list[tuple[Path, NDArray[np.float64]]]:
+    """The files and the OpenGL poses of all views of all splits, for readers of other layouts.
+
+    Raises:
+        InputError: as for :func:`load`.
+    """
+    found = []
+    for split in splits(folder):
+        file = folder / f"transforms_{split}.json"
+        meta, frames = _read_json(file)
+        mitsuba = bool(meta.get("from_mitsuba"))
+        for frame in frames:
+            pose = _pose(file, frame)
+            pose = opengl_from_mitsuba(pose[None])[0] if mitsuba else pose
+            found.append((_image_path(file, frame, images), pose))
+    return found
 
 
 # ---- The JSON file ---------------------------------------------------------
@@ -217,14 +243,23 @@ def _intrinsics(file: Path, meta: dict[str, Any], width: int, height: int) -> In
 # ---- The images ------------------------------------------------------------
 
 
-def _image_path(file: Path, frame: dict[str, Any]) -> Path:
-    """Where the frame's image is; names may contain dots, so not every suffix counts."""
+def _image_path(file: Path, frame: dict[str, Any], images: str | None = None) -> Path:
+    """Where the frame's image of a kind is; names may contain dots, so not every suffix counts."""
     path = file.parent / str(frame["file_path"])
-    if path.suffix.lower() not in IMAGE_SUFFIXES:
-        path = path.with_name(path.name + ".png")
-    if not path.is_file():
-        raise InputError(f'{path}: no such image, expected by {file}, "{frame["file_path"]}"')
-    return path
+    suffix = path.suffix.lower() if path.suffix.lower() in IMAGE_SUFFIXES else ""
+    is_kind = {None: bool(suffix), "exr": suffix == ".exr", "png": suffix not in ("", ".exr")}
+    if not is_kind[images]:
+        stem = path.stem if suffix else path.name
+        path = path.with_name(f"{stem}.{images or 'png'}")
+    if path.is_file():
+        return path
+    if images is not None:
+        option = Option("images", images)
+        raise InputError(
+            '{}: no such image, expected by {} for "{}" of {}',
+            path, option, frame["file_path"], file,
+        )  # fmt: skip
+    raise InputError(f'{path}: no such image, expected by {file}, "{frame["file_path"]}"')
 
 
 def _unique_names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:

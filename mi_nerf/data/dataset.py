@@ -16,6 +16,7 @@ from ..base.errors import InputError
 from ..cameras.ndc import Ndc
 from ..cameras.pinhole import Intrinsics
 from ..images.stored import is_stored, premultiplied
+from .surfaces import SurfaceFiles, Surfaces
 
 
 # Compared by identity: equality of arrays has no single truth value.
@@ -42,6 +43,8 @@ class Dataset:
     box: Box | None = None  # (min, max) corners of the scene, world space, likewise
     # Forward-facing captures: the projection that tames their depth; `box` is then in its space.
     ndc: Ndc | None = None
+    # The exact surfaces of the views, where they are known: one a view, or none at all.
+    surface_files: tuple[SurfaceFiles | None, ...] = ()
 
     def __post_init__(self) -> None:
         n, size = len(self.names), (self.intrinsics.height, self.intrinsics.width)
@@ -51,6 +54,8 @@ class Dataset:
             raise ValueError(f"images of type {self.images.dtype}, expected 8 or 16 bits or floats")
         if self.cam_to_world.shape != (n, 4, 4):
             raise ValueError(f"{n} views, but poses have shape {self.cam_to_world.shape}")
+        if len(self.surface_files) not in (0, n):
+            raise ValueError(f"{n} views, but surfaces of {len(self.surface_files)}")
 
     def __len__(self) -> int:
         """The number of views."""
@@ -63,6 +68,15 @@ class Dataset:
     def premultiplied(self) -> NDArray[np.float32]:
         """All views, (N, H, W, 4) premultiplied: four times the memory of 8-bit images."""
         return premultiplied(self.images)
+
+    def surfaces(self, index: int) -> Surfaces | None:
+        """The exact surfaces of view number ``index``, from its files; ``None``: not known.
+
+        Raises:
+            InputError: A file cannot be used.
+        """
+        files = self.surface_files[index] if self.surface_files else None
+        return None if files is None else files.read(self.intrinsics)
 
     def composited(self, background: ArrayLike = 1.0) -> NDArray[np.float32]:
         """The images over a background: ``rgb + (1 - a)·background`` (Porter & Duff 1984).
@@ -93,6 +107,7 @@ class Dataset:
             names=tuple(self.names[i] for i in chosen),
             images=self.images[chosen],
             cam_to_world=self.cam_to_world[chosen],
+            surface_files=tuple(self.surface_files[i] for i in chosen if self.surface_files),
         )
 
     def evenly_spread(self, n: int) -> Dataset:

@@ -13,10 +13,15 @@ The capture is brought into a frame of its own: lengths are divided by ¾ of the
 smallest near depth, so that everything lies beyond z-depth 4/3, and the average camera
 moves to the origin and looks along −z. There, :attr:`Dataset.ndc` has its near plane
 at z-depth 1. Every eighth view, from the first, is for testing; there is no ``val``.
+
+``mi-nerf generate`` also writes ``transforms_{split}.json``, whose views are those of the rows:
+they have the same poses. ``images="exr"`` reads their linear images, if ``images/`` holds none,
+and their exact surfaces are known here, too.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,12 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.box import Box
-from ..base.errors import InputError
+from ..base.errors import InputError, Option
 from ..cameras.ndc import Ndc
 from ..cameras.pinhole import Intrinsics
 from ..cameras.poses import average_pose, is_rigid
 from ..images.read import IMAGE_SUFFIXES, Progress, read_images
+from . import blender
 from .dataset import Dataset, evenly_spread_indices
+from .surfaces import SurfaceFiles
 
 POSES = "poses_bounds.npy"
 SPLITS = ("train", "test")
@@ -47,6 +54,7 @@ class _Capture(NamedTuple):
     intrinsics: Intrinsics  # at full resolution
     near: float  # smallest and largest z-depth, scene units
     far: float
+    scale: float  # its unit of length is that of the array divided by this
 
 
 def recognises(folder: Path) -> bool:
@@ -60,6 +68,7 @@ def load(
     *,
     downscale: int = 1,
     limit: int | None = None,
+    images: str | None = None,
     progress: Progress | None = None,
 ) -> Dataset:
     """Reads one split. Arguments and errors as for :func:`mi_nerf.data.load_dataset`.
@@ -68,29 +77,38 @@ def load(
         InputError: Also for captures that do not face forward.
     """
     file = folder / POSES
-    capture = _normalised(file, _read_rows(file))
-    paths = _image_paths(folder, len(capture.cam_to_world))
+    rows = _read_rows(file)
+    capture = _normalised(file, rows)
+    traced = _traced(folder, rows, images)
+    paths = _image_paths(folder, len(rows), images, traced)
     rays = _corner_rays(capture)
     _require_forward(file, paths, rays)
     chosen = _members(file, split, len(paths))
     if limit is not None:
         chosen = [chosen[i] for i in evenly_spread_indices(len(chosen), limit)]
-    images = read_images([paths[i] for i in chosen], downscale, progress)
-    intrinsics = _resized(file, capture.intrinsics, images.width, images.height)
+    stack = read_images([paths[i] for i in chosen], downscale, progress)
+    width, height = stack.width, stack.height
+    intrinsics = _resized(file, capture.intrinsics, width, height)
     ndc = Ndc(2 * intrinsics.fx / intrinsics.width, 2 * intrinsics.fy / intrinsics.height)
     return Dataset(
         path=folder,
         split=split,
-        names=tuple(paths[i].stem for i in chosen),
-        images=images.pixels,
-        color_space=images.color_space,
-        has_alpha=images.has_alpha,
+        names=_names(paths, chosen),
+        images=stack.pixels,
+        color_space=stack.color_space,
+        has_alpha=stack.has_alpha,
         cam_to_world=capture.cam_to_world[chosen],
         intrinsics=intrinsics.downscale(downscale),
         near=capture.near,
         far=capture.far,
         box=_seen_box(ndc, *rays),
         ndc=ndc,
+        surface_files=tuple(
+            _surface_files(traced.get(i), width, height, downscale, capture.scale)
+            if paths[i].parent.name == "images" or images == "exr"  # not of reduced pictures
+            else None
+            for i in chosen
+        ),
     )
 
 
@@ -123,9 +141,7 @@ def _normalised(file: Path, rows: NDArray[np.float64]) -> _Capture:
         raise InputError(
             f"{file}: row {wrong[0]}: expected depths 0 < near < far, got {near:g} and {far:g}"
         )
-    down, right, back, position = (matrices[:, :, i] for i in range(4))
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = np.stack([right, -down, back, position], axis=-1)
+    poses = _poses(rows)
     for i, pose in enumerate(poses):
         if not is_rigid(pose):
             raise InputError(f"{file}: row {i}: expected a rotation, with columns of length 1")
@@ -136,7 +152,17 @@ def _normalised(file: Path, rows: NDArray[np.float64]) -> _Capture:
     except InputError as error:
         raise InputError(f"{file}: {_EXPECTED}, its views look in opposite directions") from error
     near, far = float(bounds[:, 0].min() * scale), float(bounds[:, 1].max() * scale)
-    return _Capture(np.linalg.inv(middle) @ poses, _film(file, matrices[:, :, 4]), near, far)
+    film = _film(file, matrices[:, :, 4])
+    return _Capture(np.linalg.inv(middle) @ poses, film, near, far, float(scale))
+
+
+def _poses(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """OpenGL camera-to-world matrices, (N, 4, 4), in the units of the array."""
+    matrices = rows[:, :15].reshape(-1, 3, 5)
+    down, right, back, position = (matrices[:, :, i] for i in range(4))
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = np.stack([right, -down, back, position], axis=-1)
+    return poses
 
 
 def _film(file: Path, films: NDArray[np.float64]) -> Intrinsics:
@@ -165,15 +191,65 @@ def _members(file: Path, split: str, count: int) -> list[int]:
     return members
 
 
-def _image_paths(folder: Path, count: int) -> list[Path]:
-    """The pictures in alphabetical order, as many as there are poses."""
+def _image_paths(
+    folder: Path, count: int, images: str | None, traced: dict[int, Path]
+) -> list[Path]:
+    """The pictures of a kind in alphabetical order, as many as there are poses.
+
+    Args:
+        traced: the views that are known to lie elsewhere: these if radiance is wanted.
+    """
     pictures = _image_folder(folder)
-    paths = sorted(p for p in pictures.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES)
+    kinds = {None: IMAGE_SUFFIXES, "exr": {".exr"}, "png": IMAGE_SUFFIXES - {".exr"}}[images]
+    paths = sorted(p for p in pictures.iterdir() if p.suffix.lower() in kinds)
+    if images == "exr" and not paths:
+        if len(traced) == count:
+            return [traced[i] for i in range(count)]
+        option = Option("images", images)
+        raise InputError("{}: no OpenEXR images in it, expected by {}", pictures, option)
     if len(paths) != count:
         raise InputError(
             f"{pictures}: expected {count} images, one for each row of {POSES}, got {len(paths)}"
         )
     return paths
+
+
+def _names(paths: list[Path], chosen: list[int]) -> tuple[str, ...]:
+    """Those of the files; where these come from several folders, numbers as in ``images/``."""
+    one_folder = len({path.parent for path in paths}) == 1
+    return tuple(paths[i].stem if one_folder else f"view_{i:03d}" for i in chosen)
+
+
+# ---- What generate knows besides ---------------------------------------------
+
+
+def _traced(folder: Path, rows: NDArray[np.float64], images: str | None) -> dict[int, Path]:
+    """The files of the views that ``transforms_{split}.json`` lists, by the rows of their poses.
+
+    Raises:
+        InputError: if they cannot be read but are what to read.
+    """
+    try:
+        views = blender.views_of(folder, images)
+    except InputError:  # no business of those who read ``images/``
+        if images == "exr" and not any(_image_folder(folder).glob("*.exr")):
+            raise
+        return {}
+    found = {}
+    for i, pose in enumerate(_poses(rows)):
+        reach = 1e-6 * max(1.0, float(np.abs(pose).max()))
+        same = [path for path, other in views if np.abs(pose - other).max() <= reach]
+        if len(same) == 1:
+            found[i] = same[0]
+    return found
+
+
+def _surface_files(
+    traced: Path | None, width: int, height: int, downscale: int, scale: float
+) -> SurfaceFiles | None:
+    """Distances in the capture's units; the field's normals live in another space."""
+    files = None if traced is None else SurfaceFiles.beside(traced, width, height, downscale)
+    return None if files is None else replace(files, normal=None, scale=scale)
 
 
 def _image_folder(folder: Path) -> Path:

@@ -7,11 +7,9 @@ bleed into visible ones (Porter & Duff 1984).
 from __future__ import annotations
 
 import os
-import struct
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,20 +19,11 @@ from PIL import Image
 
 from ..base.color import ColorSpace
 from ..base.errors import InputError
+from .damage import corruption_as_input_error
+from .exr import read_color
 from .stored import empty_stack, premultiplied, with_alpha
 
 IMAGE_SUFFIXES = {".png", ".exr", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"}
-
-# What Pillow and OpenEXR raise for damaged files. Others are faults of the program.
-_DAMAGE = (
-    OSError,
-    EOFError,
-    SyntaxError,
-    ValueError,
-    RuntimeError,
-    struct.error,
-    Image.DecompressionBombError,
-)
 
 # Called as progress(done, total), always from the thread that asked for the images.
 Progress = Callable[[int, int], None]
@@ -120,9 +109,9 @@ def _read_as_floats(paths: Sequence[Path], shape: tuple[int, int, int, int]) -> 
 def read_image(path: Path) -> ImageFile:
     """Decodes one file.
 
-    OpenEXR holds linear, premultiplied values (half or float); every other
-    format is taken as straight sRGB, 8 or 16 bits a channel. Without an alpha
-    channel the image is opaque.
+    OpenEXR holds linear, premultiplied values (half or float, see
+    :func:`mi_nerf.images.exr.read_color`); every other format is taken as straight
+    sRGB, 8 or 16 bits a channel. Without an alpha channel the image is opaque.
 
     Raises:
         InputError: The file is missing or corrupt, or is neither RGB nor RGBA.
@@ -130,7 +119,8 @@ def read_image(path: Path) -> ImageFile:
     if not path.is_file():
         raise InputError(f"{path}: no such image")
     if path.suffix.lower() == ".exr":
-        return _read_exr(path)
+        pixels, has_alpha = read_color(path)
+        return ImageFile(pixels, has_alpha, "linear")
     return _read_integers(path)
 
 
@@ -166,7 +156,7 @@ def _require_same_kind(image: ImageFile, path: Path, first: ImageFile, first_pat
 
 
 def _read_integers(path: Path) -> ImageFile:
-    with _corruption_as_input_error(path):
+    with corruption_as_input_error(path):
         values, mode = _decode_integers(path)
     if mode not in ("RGB", "RGBA"):
         channels = 1 if values.ndim == 2 else values.shape[2]
@@ -200,41 +190,3 @@ def _decode_with(path: Path, layout: str) -> NDArray[np.uint8]:
         image.tile = [image.tile[0]._replace(args=layout)]
         image.load()
         return np.asarray(image)
-
-
-# ---- OpenEXR --------------------------------------------------------------
-
-
-def _read_exr(path: Path) -> ImageFile:
-    import OpenEXR  # here: most datasets do without
-
-    with _corruption_as_input_error(path):
-        # No threads of its own: the caller already has one for each core.
-        file = OpenEXR.File(str(path), separate_channels=True, num_threads=0)
-        channels, header = file.channels(), file.header()
-    if not {"R", "G", "B"} <= channels.keys():
-        found = ", ".join(sorted(channels)) or "none"
-        raise InputError(f"{path}: expected channels R, G, B and perhaps A, got {found}")
-    if not np.array_equal(header["dataWindow"], header["displayWindow"]):
-        raise InputError(f"{path}: expected a whole image, but its data window is cropped")
-
-    has_alpha = "A" in channels
-    height, width = channels["R"].pixels.shape
-    halves = all(c.pixels.dtype == np.float16 for n, c in channels.items() if n in "RGBA")
-    pixels = np.ones((height, width, 4), np.float16 if halves else np.float32)
-    for i, name in enumerate("RGBA" if has_alpha else "RGB"):
-        pixels[..., i] = channels[name].pixels
-    broken = int(np.count_nonzero(~np.isfinite(pixels).all(axis=-1)))
-    if broken:
-        raise InputError(f"{path}: expected finite values, {broken} pixel(s) are NaN or infinite")
-    return ImageFile(pixels, has_alpha, "linear")
-
-
-@contextmanager
-def _corruption_as_input_error(path: Path) -> Iterator[None]:
-    """Decoders raise exceptions of many types for damaged files; users see one."""
-    try:
-        yield
-    except _DAMAGE as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{path}: corrupt or unreadable image ({reason})") from error

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Image, vector3_type
-from ..base.color import linear_to_srgb
+from ..base.color import linear_to_srgb, srgb_to_linear
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from .marched import MarchedField
 from .render import render_rays
@@ -49,7 +49,7 @@ def render_view(
     passes, queries = [], 0
     for i in range(side * side):
         offset = ((i % side + 0.5) / side, (i // side + 0.5) / side)
-        o, d = _rays(intrinsics, cam_to_world, backend, offset)
+        o, d = camera_rays(intrinsics, cam_to_world, backend, offset)
         seen = render_rays(marched, o, d)
         passes.append([np.array(v) for v in (*seen.color, seen.opacity, seen.depth)])
         queries += seen.queries
@@ -67,9 +67,28 @@ def display_image(view: View, color_space: str, background: float = 1.0) -> Imag
     return linear_to_srgb(image) if color_space == "linear" else image
 
 
-def _rays(
-    intrinsics: Intrinsics, cam_to_world: ArrayLike, backend: Any, offset: tuple[float, float]
+def linear_premultiplied(color: Image, opacity: Image, color_space: str) -> Image:
+    """(H, W, 3) linear radiance of premultiplied colours in the field's colour space."""
+    if color_space == "linear":
+        return color
+    alpha = opacity[..., None]
+    straight = color / np.where(alpha > 0, alpha, 1)
+    return np.where(alpha > 0, srgb_to_linear(straight) * alpha, 0)
+
+
+def camera_rays(
+    intrinsics: Intrinsics,
+    cam_to_world: ArrayLike,
+    backend: Any,
+    offset: tuple[float, float] = (0.5, 0.5),
 ) -> tuple[Any, Any]:
+    """Origins and unit directions of the rays through one point of every pixel, row by row.
+
+    Args:
+        cam_to_world: (4, 4), OpenGL axes.
+        backend: ``drjit.llvm.ad`` or ``drjit.cuda.ad``.
+        offset: the point, from the upper left corner of a pixel.
+    """
     float_type, uint = backend.Float, backend.UInt32
     width = dr.opaque(uint, intrinsics.width)
     index = dr.arange(uint, intrinsics.width * intrinsics.height)

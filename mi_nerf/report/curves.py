@@ -161,8 +161,9 @@ def read_curve(folder: Path) -> list[Record]:
 def _look(run: Run, split: str, views: int) -> Record:
     """The quality of a field in training."""
     config = read_json(run.folder / CONFIG, "the config.json of a run")
-    target = Target(run.folder, run.field_file(), config, run.config.downscale)
-    found = evaluate(target, run.variant, split=split, views=views)
+    settings = run.config
+    target = Target(run.folder, run.field_file(), config, settings.downscale, settings.images)
+    found = evaluate(target, run.variant, split=split, views=views, geometry=False)
     return {**found["mean"], "queries_per_ray": found["queries_per_ray"]}
 
 

@@ -100,7 +100,9 @@ def profile_run(
         raise InputError(f"{target.path}: a field file, expected a run with its checkpoint")
     backend = array_module(variant)
     config, _ = read_config(target.path)
-    dataset = load_dataset(target.data, "train", downscale=config.downscale, limit=config.views)
+    dataset = load_dataset(
+        target.data, "train", downscale=config.downscale, limit=config.views, images=config.images
+    )
     trainer = Trainer(config, dataset, backend)
     load_checkpoint(target.path / CHECKPOINT, trainer)
     profile = profile_steps(trainer, on_step=on_step)

@@ -162,7 +162,7 @@ def _places(
         kind = "a formula" if target is None else "a field file, which knows no cameras"
         return None, f"{subject.name} is {kind}: --point says where to look"
     try:
-        views = load_dataset(folder, "train", downscale=target.downscale)
+        views = load_dataset(folder, "train", downscale=target.downscale, images=target.images)
         found = find_points(subject.marched, views.intrinsics, views.cam_to_world, subject.backend)
     except InputError as error:
         return None, str(error)

@@ -146,7 +146,9 @@ def ablate(
 
 def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]:
     """What the table says of a finished run."""
-    found = evaluate(run.folder, variant, split=settings["split"], views=settings["views"])
+    found = evaluate(
+        run.folder, variant, split=settings["split"], views=settings["views"], geometry=False
+    )
     names = ("queries_per_ray", "parameters", "views", "size")
     return {**found["mean"], "train_seconds": run.seconds, **{n: found[n] for n in names}}
 

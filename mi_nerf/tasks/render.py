@@ -14,7 +14,6 @@ import numpy as np
 
 from ..base.arrays import Image
 from ..base.checks import valid_size
-from ..base.color import srgb_to_linear
 from ..base.errors import InputError, Option
 from ..base.files import check_file, check_folder, make_folder, replacing
 from ..base.variants import array_module, using_variant
@@ -23,7 +22,7 @@ from ..cameras.poses import mitsuba_from_opengl, opengl_from_mitsuba
 from ..cameras.trajectory import Poses, forward_spiral, orbit, orbit_like, spiral_like
 from ..data import Dataset, held_out_split, load_dataset
 from ..images.write import on_white, write_picture
-from ..march.view import render_view
+from ..march.view import linear_premultiplied, render_view
 from ..scene_xml.scene_file import SceneFile
 from .target import Target, open_target
 
@@ -254,11 +253,11 @@ def _cameras(target: Target, path: Path_) -> Dataset:
     """The views whose cameras a path follows."""
     assert target.data is not None
     if path != "test":
-        return load_dataset(target.data, "train", downscale=target.downscale)
+        return load_dataset(target.data, "train", downscale=target.downscale, images=target.images)
     split = held_out_split(target.data)
     if split is None:
         raise InputError("{}: has no test views, expected {} or {}", target.data, *_MOVING)
-    return load_dataset(target.data, split, downscale=target.downscale)
+    return load_dataset(target.data, split, downscale=target.downscale, images=target.images)
 
 
 def default_path(target: Target) -> Path_:
@@ -302,11 +301,8 @@ def _resized(intrinsics: Intrinsics, size: tuple[int, int] | None) -> Intrinsics
 
 
 def _linear_rgba(color: Image, opacity: Image, color_space: str) -> Image:
-    alpha = opacity[..., None]
-    if color_space == "srgb":
-        straight = color / np.where(alpha > 0, alpha, 1)
-        color = np.where(alpha > 0, srgb_to_linear(straight) * alpha, 0)
-    return np.concatenate([color, alpha], axis=-1).astype(np.float32)
+    radiance = linear_premultiplied(color, opacity, color_space)
+    return np.concatenate([radiance, opacity[..., None]], axis=-1).astype(np.float32)
 
 
 def _rgba(image: Any, film: Any) -> Image:

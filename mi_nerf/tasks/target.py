@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ..base.errors import InputError
+from ..data import ImageKind
 from ..formats.field_file import FieldFile, load_field
 from ..training.run import Run
 from ..training.run_folder import CONFIG, FIELD, LOG, read_record
@@ -21,6 +22,7 @@ class Target:
     contents: FieldFile
     record: dict[str, Any] | None  # config.json of the run; None for a lone field file
     downscale: int = 1  # the scale at which the run saw its images
+    images: ImageKind | None = None  # the kind of files that it saw; None: as the data name them
 
     @property
     def data(self) -> Path | None:
@@ -63,9 +65,12 @@ def open_target(path: str | Path | Target | Run) -> Target:
             raise InputError(
                 f"{target / CONFIG}: downscale={downscale!r}, expected a whole number above 0"
             )
+        images = record["settings"].get("images")
+        if images not in (None, "png", "exr"):
+            raise InputError(f"{target / CONFIG}: images={images!r}, expected png, exr or null")
         if not (target / FIELD).exists():
             raise InputError(f"{target}: no {FIELD} yet, expected a run with a checkpoint")
-        return Target(target, load_field(target / FIELD), record, downscale)
+        return Target(target, load_field(target / FIELD), record, downscale, images)
     if not target.exists():
         raise InputError(f"{target}: not found, expected a run folder or a field file")
     return Target(target, load_field(target), None)

@@ -14,6 +14,7 @@ from ..base.arrays import gather_vector3, taken
 from ..base.kernel_stages import stage
 from ..cameras.pinhole import Intrinsics, pack_poses, pixel_rays
 from ..data import Dataset, evenly_spread_indices
+from ..images.metrics import tone_mapped
 from ..images.read import average_blocks
 from ..images.stored import premultiplied
 from .config import PyramidConfig
@@ -190,16 +191,19 @@ def _window(film: Intrinsics, crop: float) -> tuple[int, int, int, int]:
     return columns, rows, (film.width - columns) // 2, (film.height - rows) // 2
 
 
-def blank_loss(dataset: Dataset, background: str, level: int = 0) -> float:
+def blank_loss(dataset: Dataset, background: str, level: int = 0, loss: str = "mse") -> float:
     """Mean squared error of a field that has collapsed: empty space, or one even colour.
 
     Whichever is smaller; a field that has learnt anything stays below a good part of it.
 
     Args:
         level: the coarsest of a pyramid, whose pixels differ least.
+        loss: ``relative`` for the error after tone mapping, which goes with that loss.
     """
     pixels = _some_pixels(dataset, level).astype(np.float64)
     color, alpha = pixels[:, :3], pixels[:, 3:]
+    if loss == "relative":
+        return _blank_tone_mapped(color, alpha, background)
     if background == "random":  # the mean over all backgrounds, uniform in [0, 1]
         empty = np.mean(np.square(color - alpha / 2)) + np.mean(np.square(alpha)) / 12
         return float(empty)
@@ -207,6 +211,17 @@ def blank_loss(dataset: Dataset, background: str, level: int = 0) -> float:
     empty = np.mean(np.square(color - alpha * behind))
     even = np.mean(np.var(color + (1 - alpha) * behind, axis=0))
     return float(min(empty, even) if empty > 0 else even)
+
+
+def _blank_tone_mapped(
+    color: np.ndarray[Any, Any], alpha: np.ndarray[Any, Any], background: str
+) -> float:
+    """Before random backgrounds, it is the premultiplied radiance that is compared."""
+    behind = 1.0 if background == "white" else 0.0
+    seen = tone_mapped(color + (1 - alpha) * behind)
+    empty = float(np.mean(np.square(seen - tone_mapped(behind))))
+    even = float(np.mean(np.var(seen, axis=0)))
+    return empty if background == "random" else min(empty, even) if empty > 0 else even
 
 
 def _some_pixels(dataset: Dataset, level: int) -> np.ndarray[Any, Any]:

@@ -147,10 +147,12 @@ class TrainConfig:
     steps: int | None = None  # stop after so many steps
     max_seconds: float | None = None  # stop after so much wall-clock time
     downscale: int = 1  # images are averaged over blocks of K×K pixels
+    images: Literal["png", "exr"] | None = None  # files of views; none: those the data name
     views: int | None = None  # train on so many views, evenly spread; none: all
     box: tuple[float, float, float, float, float, float] | None = None  # min, max; none: found
     background: Literal["auto", "white", "black", "random"] = "auto"  # auto: random with alpha
     loss: Literal["auto", "mse", "relative"] = "auto"  # auto: relative for linear images
+    loss_floor: float = 1e-3  # radiance below which the relative loss becomes absolute
     color_activation: Literal["auto"] | ColorActivation = "auto"  # auto: exp for linear images
     network: NetworkConfig = field(default_factory=NetworkConfig)
     position: FourierEncoding | None = None  # none: as many octaves as the images resolve
@@ -174,7 +176,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         require(self, "seed", at_least=0, below=1 << 31)
         require(self, "steps downscale views max_skipped", at_least=1)
-        require(self, "max_seconds", above=0)
+        require(self, "max_seconds loss_floor", above=0)
         require(self, "report_every checkpoint_every crop_steps", at_least=0)
         require(self, "crop", above=0, at_most=1)
         require(self, "collapse_check max_restarts", at_least=0)

@@ -411,7 +411,9 @@ def start(
     if not recorded:
         config = for_device(config, variant, given)
     check_folder(folder)
-    dataset = load_dataset(data, "train", downscale=config.downscale, limit=config.views)
+    dataset = load_dataset(
+        data, "train", downscale=config.downscale, limit=config.views, images=config.images
+    )
     expected = None
     if config.preset in PUBLISHED_STEPS and not recorded:
         expected = forecast(config, dataset, array_module(variant))

@@ -20,7 +20,7 @@ from ..fields.protocol import Field
 from ..march.marched import MarchedField
 from ..march.occupancy import OccupancyGrid
 from ..march.placing import place_samples, refine
-from ..march.quadrature import Composite, integrate, over_background
+from ..march.quadrature import Composite, integrate
 from ..march.query import Evaluation
 from ..march.render import render_rays
 from ..march.samples import Samples, rays_with_samples
@@ -29,7 +29,7 @@ from .batches import RayBatch, RaySource, blank_loss, step_rng
 from .config import TrainConfig
 from .growth import Reshaping, Snapshot, field_in_shape, reshaped
 from .loss_scale import LossScale
-from .losses import LOSSES, mean_squared_error, squared_error
+from .losses import RayLoss
 from .model import carved_cells, field_config
 from .optimizer import Adam, JointParameters
 from .scaling import resolved
@@ -135,13 +135,13 @@ class Trainer:
             self.background = "random" if dataset.has_alpha else "white"
         self._noise_level = 0.0 if dataset.has_alpha else config.density.noise
         self._images = RaySource(dataset, self.background, backend.Float, config.pyramid)
-        self.blank_loss = blank_loss(dataset, self.background, config.pyramid.levels or 0)
         self.learn_from()
         loss = config.loss
         if loss == "auto":
             loss = "mse" if dataset.color_space == "srgb" else "relative"
-        self._loss = LOSSES[loss]
-        self._over_all_backgrounds = self.background == "random" and self._loss is squared_error
+        self._loss = RayLoss(loss, self.background, config.loss_floor)
+        level = config.pyramid.levels or 0
+        self.blank_loss = blank_loss(dataset, self.background, level, loss)
         self.step_count = 0
         self.attempt = 0  # restarts after a collapse so far
         self.rays_per_step = 0.0
@@ -304,9 +304,9 @@ class Trainer:
             seen = render_rays(
                 MarchedField(field or self.field, march, self.occupancy), batch.o, batch.d
             )
-            predicted = over_background(seen.color, seen.opacity, batch.background)
-            target = over_background(batch.color, batch.alpha, batch.background)
-            return float(dr.mean(self._loss(predicted, target))[0])
+            relative = self._loss.kind == "relative"
+            measure = self._loss if relative else self._loss.before
+            return float(dr.mean(measure(seen.color, seen.opacity, batch)[0])[0])
 
     # ---------------------------- The phases of a step ------------------------------
 
@@ -442,25 +442,16 @@ class Trainer:
         loss, mse = float_type(0), float_type(0)
         if numbers is not None:
             zero = float_type(0)
-            nothing = self._error_of_rays(batch, [zero, zero, zero], zero)
+            nothing = self._loss([zero, zero, zero], zero, batch)
             blank = dr.full(dr.mask_t(float_type), True, batch.rays)
             dr.make_opaque(blank)
             dr.scatter(blank, False, numbers)
             loss, mse = (dr.sum(dr.select(counts & blank, e, 0)) * weight for e in nothing)
             batch, counts = batch.at(numbers), numbers < complete
-        errors = self._error_of_rays(batch, seen.color, seen.opacity)
+        errors = self._loss(seen.color, seen.opacity, batch)
         loss = loss + dr.sum(dr.select(counts, errors[0], 0)) * weight
         mse = mse + dr.sum(dr.select(counts, dr.detach(errors[1]), 0)) * weight
         return loss, mse
-
-    def _error_of_rays(self, batch: RayBatch, color: list[Any], alpha: Any) -> tuple[Any, Any]:
-        """Loss and squared error of every ray that sees these premultiplied colours."""
-        if self._over_all_backgrounds:
-            error = mean_squared_error(color, alpha, batch.color, batch.alpha)
-            return error, error
-        predicted = over_background(color, alpha, batch.background)
-        target = over_background(batch.color, batch.alpha, batch.background)
-        return self._loss(predicted, target), squared_error(predicted, target)
 
     def _ray_count(self) -> int:
         """Rays of the next step, in coarse steps so that arrays are seldom resized."""

@@ -12,7 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mi_nerf.base.color import linear_to_srgb, srgb_to_linear
-from mi_nerf.images.metrics import psnr, ssim, to_8bit
+from mi_nerf.images.metrics import (
+    psnr,
+    psnr_log,
+    psnr_tone_mapped,
+    ssim,
+    to_8bit,
+    tone_mapped,
+)
 
 
 def image_pair(height: int, width: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
@@ -167,3 +174,41 @@ def test_srgb_of_drjit_arrays(name: str, function) -> None:
     slope = (function(exact + step) - function(exact - step)) / (2 * step)
     assert np.asarray(y).reshape(-1) == pytest.approx(function(exact), rel=1e-6, abs=1e-7)
     assert np.asarray(dr.grad(x)).reshape(-1) == pytest.approx(slope, rel=1e-4)
+
+
+# ---- Radiance ---------------------------------------------------------------------
+
+
+def test_radiance_by_loops() -> None:
+    rng = np.random.default_rng(0)
+    a, b = 10 ** rng.uniform(-4, 4, (2, 3, 4, 3))
+    logs, tones = [], []
+    for x, y in zip(a.ravel(), b.ravel(), strict=True):
+        logs.append((math.log10(x + 1e-3) - math.log10(y + 1e-3)) ** 2)
+        mapped = [v / (1 + v) for v in (x, y)]
+        coded = [12.92 * v if v <= 0.0031308 else 1.055 * v ** (1 / 2.4) - 0.055 for v in mapped]
+        tones.append((coded[0] - coded[1]) ** 2)
+    assert psnr_log(a, b) == pytest.approx(-10 * math.log10(np.mean(logs)))
+    assert psnr_tone_mapped(a, b) == pytest.approx(-10 * math.log10(np.mean(tones)))
+
+
+@pytest.mark.parametrize("level", [1.0, 1e2, 1e4])
+def test_the_same_factor_counts_the_same_at_any_brightness(level: float) -> None:
+    """A tenth of a decade is 20 dB; brightness far from black does not matter."""
+    image = np.full((4, 5, 3), level)
+    assert psnr_log(image * 10**0.1, image) == pytest.approx(20, abs=0.01)
+    assert psnr_log(image / 10**0.1, image) == pytest.approx(20, abs=0.01)
+
+
+def test_tone_mapping_stays_below_one() -> None:
+    radiance = np.array([0.0, -1.0, 1.0, 1e4, np.nan])
+    mapped = tone_mapped(radiance)
+    assert mapped[:2].tolist() == [0, 0] and np.isnan(mapped[4])
+    assert mapped[2] == pytest.approx(linear_to_srgb(np.float64(0.5))) and 0.999 < mapped[3] < 1
+
+
+def test_equal_radiance() -> None:
+    image = np.full((2, 2, 3), 7.0)
+    assert psnr_log(image, image) == psnr_tone_mapped(image, image) == math.inf
+    with pytest.raises(ValueError, match="agree in shape"):
+        psnr_log(image, image[:1])

@@ -12,6 +12,7 @@ from PIL import Image
 
 from mi_nerf.cameras.pinhole import Intrinsics
 from mi_nerf.cameras.poses import look_at
+from mi_nerf.images.write import encoded
 
 
 def write_blender_dataset(
@@ -59,6 +60,14 @@ def orbit_poses(n: int, radius: float = 4.0, height: float = 1.0) -> np.ndarray:
     )
 
 
+def exact_rays(camera: Intrinsics, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origin, (3,), and unit directions, (H, W, 3), through the centres of pixels, in float64."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    local = [(x - camera.cx) / camera.fx, (camera.cy - y) / camera.fy, -np.ones_like(x)]
+    d = np.stack(local, axis=-1) @ pose[:3, :3].T
+    return pose[:3, 3], d / np.linalg.norm(d, axis=-1, keepdims=True)
+
+
 def blob_images(
     poses: np.ndarray, size: int, angle_x: float, *, mirror: bool = False
 ) -> np.ndarray:
@@ -91,6 +100,39 @@ def write_blob_dataset(folder: Path, *, train: int = 8, test: int = 5, size: int
     for split, count, height in (("train", train, 1.0), ("test", test, 1.5)):
         poses = orbit_poses(count, height=height)
         write_blender_dataset(folder, blob_images(poses, size, 0.6), poses, 0.6, split)
+    return folder
+
+
+def radiant_images(poses: np.ndarray, size: int, angle_x: float) -> np.ndarray:
+    """A dark ball with a lamp of radiance 50 on top: linear premultiplied RGBA, (N, H, W, 4).
+
+    It is matt: 0.01 below, 0.4 near the lamp, and a little redder than green and blue.
+    """
+    camera = Intrinsics.from_angle_x(size, size, angle_x)
+    images = []
+    for pose in poses:
+        o, d = exact_rays(camera, pose)
+        b = d @ o
+        depth = 0.64 - (o @ o - b * b)  # below 0 where the ray misses
+        height = (o - d * (b + np.sqrt(np.maximum(depth, 0)))[..., None])[..., 2] / 0.8
+        light = np.where(height > 0.7, 50, 0.01 + 0.4 * np.clip(height, 0, 1) ** 2)
+        alpha = np.clip(depth / 0.1, 0, 1)
+        color = light[..., None] * np.array([1, 0.9, 0.8]) * alpha[..., None]
+        images.append(np.concatenate([color, alpha[..., None]], axis=-1))
+    return np.array(images, np.float32)
+
+
+def write_radiant_dataset(folder: Path, *, size: int = 24) -> Path:
+    """:func:`radiant_images` as ``generate`` writes them, EXR and PNG; returns ``folder``."""
+    for split, count, height in (("train", 10, 2.0), ("test", 3, 2.5)):
+        poses = orbit_poses(count, height=height)
+        images = radiant_images(poses, size, 0.6)
+        pictures = np.rint(255 * np.array([encoded(image) for image in images]))
+        write_blender_dataset(folder, pictures.astype(np.uint8), poses, 0.6, split)
+        for i, image in enumerate(images):
+            planes = np.ascontiguousarray(np.moveaxis(image, -1, 0))
+            file = folder / split / f"r_{i}.exr"
+            write_exr(file, **dict(zip("RGBA", planes, strict=True)))
     return folder
 
 

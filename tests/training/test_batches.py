@@ -14,6 +14,7 @@ from mi_nerf.base.errors import InputError
 from mi_nerf.cameras.pinhole import Intrinsics
 from mi_nerf.commands.shared import flag
 from mi_nerf.data import Dataset
+from mi_nerf.images.metrics import tone_mapped
 from mi_nerf.images.read import average_blocks
 from mi_nerf.training import pixels
 from mi_nerf.training.batches import RayBatch, RaySource, blank_loss, step_rng
@@ -163,3 +164,21 @@ def test_a_collapsed_field_at_a_coarse_level(background: str) -> None:
     found = blank_loss(dataset, background, level=2)
     assert found == pytest.approx(blank_loss(coarse, background))
     assert found < blank_loss(dataset, background)
+
+
+@pytest.mark.parametrize("background", ["white", "black", "random"])
+def test_a_collapsed_field_of_radiance(background: str) -> None:
+    """Errors after tone mapping; with random backgrounds, of what is premultiplied."""
+    rng = np.random.default_rng(0)
+    alpha = rng.random((3, 8, 8, 1)).astype(np.float32)
+    color = alpha * 10 ** rng.uniform(-3, 3, (3, 8, 8, 3)).astype(np.float32)
+    images = np.concatenate([color, alpha], axis=-1)
+    camera = Intrinsics.from_angle_x(8, 8, 0.6)
+    base = random_views(np.uint8, (3, 8, 8))
+    dataset = replace(base, images=images, color_space="linear", intrinsics=camera)
+    behind = 1.0 if background == "white" else 0.0
+    seen = tone_mapped(color.astype(np.float64) + (1 - alpha) * behind).reshape(-1, 3)
+    empty = np.mean((seen - tone_mapped(np.float64(behind))) ** 2)
+    even = np.mean((seen - seen.mean(axis=0)) ** 2)
+    expected = empty if background == "random" else min(empty, even)
+    assert blank_loss(dataset, background, 0, "relative") == pytest.approx(expected, rel=1e-5)
