@@ -123,6 +123,8 @@ def _layers(path: Path) -> list[_Layer]:
         # No threads of its own: the caller already has one for each core.
         file = OpenEXR.File(str(path), separate_channels=True, num_threads=0)
         parts = [(part.header, part.channels) for part in file.parts]
+        if not parts:  # of a header that was cut short
+            raise ValueError("it holds no image")
     whole: dict[int, bool] = {}
     layers: dict[tuple[int, str], dict[str, NDArray[Any]]] = {}
     for number, (header, channels) in enumerate(parts):

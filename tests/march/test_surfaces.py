@@ -23,7 +23,7 @@ POSE = orbit_poses(5, height=1.3)[2]
 
 def test_an_opaque_ball(ad: Any) -> None:
     """A shell so dense that light ends within 0.002 of its surface, where it is met."""
-    shell = {"inner": 0.3, "outer": 0.6, "density": 4000.0, "edge": 0.02, "center": (0.1, 0, 0.05)}
+    shell = {"inner": 0.3, "outer": 0.6, "density": 4000.0, "edge": 2e-3, "center": (0.1, 0, 0.05)}
     marched = MarchedField(closed_form("shell", shell, ad.TensorXf), MarchSettings(samples=4096))
     found = field_surfaces(marched, CAMERA, POSE, ad)
     o, d = exact_rays(CAMERA, POSE)
@@ -36,9 +36,12 @@ def test_an_opaque_ball(ad: Any) -> None:
     assert inside.sum() > 20 and (square < -0.05).sum() > 20
     assert found.opacity[inside] == pytest.approx(1, abs=1e-5)
     assert np.all(found.opacity[square < -0.05] == 0)
-    assert found.depth[inside] == pytest.approx(distance[inside], abs=0.012)
+    assert found.depth[inside] == pytest.approx(distance[inside], abs=4e-3)
     assert found.normal is not None
-    cosine = np.sum(found.normal * normal, axis=-1)[inside]
+    # Shorter where part of the light ends within, where density is even.
+    length = np.linalg.norm(found.normal, axis=-1)[inside]
+    assert np.all((length > 0.5) & (length < 1 + 1e-5))
+    cosine = np.sum(found.normal * normal, axis=-1)[inside] / length
     assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 1.5
     assert np.all(found.normal[square < -0.05] == 0) and np.all(found.depth[square < -0.05] == 0)
 

@@ -68,7 +68,8 @@ def test_colours_that_depend_on_the_view() -> None:
 
 def test_pairs_by_loops() -> None:
     """Point by point and view by view, with pictures of noise."""
-    surfaces, _, poses = scene(3)
+    surfaces, _, poses = scene(8)
+    surfaces, poses = surfaces[:3], poses[:3]
     rng = np.random.default_rng(0)
     pictures, truths = (list(rng.random((3, 36, 40, 3))) for _ in range(2))
     changes = color_changes(pictures, truths, surfaces, CAMERA, poses)

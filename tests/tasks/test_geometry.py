@@ -117,7 +117,7 @@ def test_nothing_to_compare() -> None:
 
 def test_a_ball_whose_surface_is_known(ad: Any, tmp_path: Path) -> None:
     """A dense shell as the field, a sphere of NumPy's as the truth."""
-    shell = {"inner": 0.3, "outer": 0.6, "density": 4000.0, "edge": 0.01}
+    shell = {"inner": 0.3, "outer": 0.6, "density": 4000.0, "edge": 2e-3}
     marched = MarchedField(closed_form("shell", shell, ad.TensorXf), MarchSettings(samples=4096))
     camera, pose = Intrinsics.from_angle_x(20, 20, 0.5), orbit_poses(3)[1]
     o, d = exact_rays(camera, pose)
