@@ -82,3 +82,54 @@ def test_scenes_without_instances_are_left_alone(scene: Path) -> None:
     )
     shapes = SceneFile(scene).load().shapes()
     assert sum(shape.class_name() == "Sphere" for shape in shapes) == 3
+
+
+# ---- Where a copy would look different ---------------------------------------
+
+MOVES = {
+    "turned": '<rotate x="1" angle="30"/><scale value="0.7"/><translate x="0.3"/>',
+    "uneven": '<scale x="1" y="1.5" z="0.6"/>',
+    "sheared": '<matrix value="1 0.4 0 0  0 1 0 0  0 0 1 0  0 0 0 1"/>',
+    "mirrored": '<scale x="-1"/>',
+}
+KEPT_AS_INSTANCES = {("ball", "uneven"), ("ball", "sheared")}
+
+
+@pytest.mark.parametrize("move", MOVES)
+@pytest.mark.parametrize("kind", ["ball", "mesh"])
+def test_any_place_looks_the_same(scene: Path, kind: str, move: str) -> None:
+    """One-sided materials are black from behind: a mirrored copy would show that."""
+    shape = {
+        "ball": '<shape type="sphere"><float name="radius" value="0.5"/>'
+        '<bsdf type="diffuse"/></shape>',
+        "mesh": '<shape type="cube"><transform name="to_world"><scale value="0.4"/></transform>'
+        '<bsdf type="diffuse"/></shape>',
+    }[kind]
+    head, tail = SCENE.split('<bsdf type="diffuse" id="red">')[0], "</scene>"
+    scene.write_text(
+        f"""{head}<shape type="shapegroup" id="g">{shape}</shape>
+        <shape type="instance"><ref id="g"/><transform name="to_world">{MOVES[move]}</transform>
+        </shape>{tail}"""
+    )
+    found = SceneFile(scene).load()
+    kinds = {s.class_name() for s in found.shapes()}
+    assert ("Instance" in kinds) == (move == "mirrored" or (kind, move) in KEPT_AS_INSTANCES)
+    images = [
+        np.array(mi.render(s, spp=128, seed=k))
+        for s, k in ((mi.load_file(str(scene)), 0), (found, 1))
+    ]
+    difference = (images[0] - images[1])[..., :3]
+    assert np.abs(difference.mean(axis=(0, 1))).max() < 5e-3
+    assert np.abs(difference).mean() < 0.03
+
+
+def test_some_are_copied_and_others_stay(scene: Path) -> None:
+    scene.write_text(
+        SCENE.replace(
+            '<shape type="instance" id="plain"><ref id="pair"/>',
+            '<shape type="instance" id="plain"><ref id="pair"/><transform name="to_world">'
+            '<scale x="-1"/></transform>',
+        )
+    )
+    kinds = [shape.class_name() for shape in SceneFile(scene).load().shapes()]
+    assert kinds.count("Instance") == 1 and kinds.count("Sphere") == 2
