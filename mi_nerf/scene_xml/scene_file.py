@@ -15,6 +15,7 @@ import numpy as np
 from ..base.errors import InputError
 from .instancing import copy_instances
 from .provenance import digest, files_of
+from .spectra import spectra_as_values
 from .substitutes import substitute
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
@@ -53,6 +54,8 @@ class SceneFile:
             mi.parser.transform_upgrade(self._config, parsed)
             mi.parser.transform_resolve(self._config, parsed)
         _tell_names(parsed)
+        if "spectral" not in mi.variant():
+            self.notes += spectra_as_values(parsed)
         self._state = parsed
 
     def default(self, name: str) -> str | None:
