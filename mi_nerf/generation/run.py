@@ -17,7 +17,8 @@ from ..base.interrupts import interruptible
 from ..base.machine import versions
 from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
-from ..scene_xml.scene_file import SceneFile, quiet, visible_bounds
+from ..scene_xml.scene_file import SceneFile, visible_bounds
+from ..scene_xml.scene_file import quiet as _quiet
 from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View, make_plan, protocol_name
 from .protocol import SPLITS, Options
@@ -64,7 +65,7 @@ def generate(
     folder = Path(out)
     _check_output(folder, resume)
     with using_variant(variant):
-        with quiet():
+        with _quiet():
             file = SceneFile(scene, parameters)
             tracer, plan = prepare(file, options or Options())
         record = json.loads(json.dumps(_describe(file, plan, variant)))  # as it will be read
@@ -115,6 +116,7 @@ def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
     import mitsuba as mi
 
     file.substitute("Film", "Integrator", "ReconstructionFilter", "Sampler", "Sensor")
+    file.complete()
     hide = protocol_name(file, options) != "forward"
     integrators = file.plugins("Integrator")
     if hide:

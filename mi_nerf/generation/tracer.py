@@ -11,7 +11,7 @@ from ..base.arrays import Image
 from ..base.errors import InputError
 from ..cameras.pinhole import sensor_dict
 from ..cameras.poses import mitsuba_from_opengl
-from ..scene_xml.scene_file import refused_rendering
+from ..scene_xml.refusals import refused_rendering
 from .plan import Plan, View
 from .surfaces import trace_surfaces
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,8 +14,9 @@ import numpy as np
 from ..base.errors import InputError
 from .instancing import copy_instances
 from .provenance import digest, files_of
+from .refusals import check_file, refusal
 from .spectra import spectra_as_values
-from .substitutes import substitute
+from .substitutes import add_integrator, substitute
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -41,7 +41,7 @@ class SceneFile:
         self.path = Path(path)
         self.parameters = dict(parameters or {})
         self.notes: list[str] = []
-        _check_file(self.path)
+        check_file(self.path)
         self._absolute = Path(os.path.abspath(self.path))
         # Beside the file, or beside what it is a link to; then what its <path>s add.
         self._folders = [str(self._absolute.parent), str(self.path.resolve().parent)]
@@ -92,8 +92,20 @@ class SceneFile:
         """
         self.notes += substitute(self._state, kinds)
 
-    def load(self) -> Any:
+    def complete(self) -> None:
+        """Gives a scene that has no integrator the usual one, which is added to ``notes``."""
+        self.notes += add_integrator(self._state)
+
+    @property
+    def state(self) -> Any:
+        """What Mitsuba's parser found, upgraded and resolved; changes count for the next load."""
+        return self._state
+
+    def load(self, *, merge: bool = True) -> Any:
         """Creates the scene.
+
+        Args:
+            merge: Meshes of one material become one, which renders faster.
 
         Raises:
             InputError: with what Mitsuba says, if it refuses.
@@ -104,7 +116,8 @@ class SceneFile:
         with self._one_line_errors(), self._search_path():
             copy_instances(state)
             mi.parser.transform_merge_equivalent(self._config, state)
-            mi.parser.transform_merge_meshes(self._config, state)
+            if merge:
+                mi.parser.transform_merge_meshes(self._config, state)
             scene = mi.parser.instantiate(self._config, state)
         return scene[0] if isinstance(scene, list) else scene
 
@@ -129,7 +142,7 @@ class SceneFile:
                 "declared in its first line"
             ) from error
         except RuntimeError as error:  # for all that can be wrong, what plugins raise included
-            message = _refusal(str(error))
+            message = refusal(str(error))
             if message is None:
                 raise
             message = message.replace(str(self._absolute), self.path.name)
@@ -184,34 +197,6 @@ def visible_bounds(scene: Any) -> Bounds | None:
     return tuple(lower.tolist()), tuple(upper.tolist())
 
 
-def refused_rendering(error: RuntimeError) -> str | None:
-    """What Mitsuba says, in one line, if one of its own plugins cannot do what a picture takes.
-
-    Dr.Jit wraps what happens inside a custom operation. ``None`` for faults of programs.
-    """
-    cause = error.__cause__ or error
-    if type(cause) is not RuntimeError or not re.match(r"\[\w+\] ", str(cause)):
-        return None
-    return f"Mitsuba cannot render this scene: {' '.join(str(cause).split())}"
-
-
-def _check_file(path: Path) -> None:
-    """Refuses what is no file that can be read, before Mitsuba says so in its own way."""
-    try:
-        os.fsencode(path).decode()
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder, expected a Mitsuba XML scene")
-        with path.open("rb"):
-            pass
-    except FileNotFoundError:
-        raise InputError(f"{path}: not found, expected a Mitsuba XML scene") from None
-    except UnicodeError:
-        raise InputError(f"{os.fsencode(path)!r}: expected a name in UTF-8") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be read: {reason}") from error
-
-
 def _tell_names(state: Any) -> None:
     """Gives objects whose names are in no known encoding others, which Python can tell."""
     for i, node in enumerate(state.nodes):
@@ -219,20 +204,3 @@ def _tell_names(state: Any) -> None:
             node.props.id()
         except UnicodeDecodeError:
             node.props.set_id(f"unnamed_{i}")
-
-
-def _refusal(message: str) -> str | None:
-    """What Mitsuba says, in one line; None if a Python plugin failed by a fault of its own.
-
-    An exception of a plugin comes as the text of its traceback. Plugins of mi_nerf refuse by
-    InputError, those of Mitsuba and others by a plain Exception.
-    """
-    before, found, traceback = message.partition("Traceback (most recent call last):")
-    if found:
-        said = re.search(r"^(?:[\w.]+\.)?(\w+): (.*)", traceback, re.MULTILINE | re.DOTALL)
-        if said is None or said[1] not in ("InputError", "Exception", "RuntimeError"):
-            return None
-        message = before + said[2]
-    # Of files that include each other, the innermost complaint; places in Mitsuba's own sources go.
-    message = message.rpartition("while processing <include>:")[2]
-    return " ".join(re.sub(r"\[\w+\.cpp:\d+\] ", "", message).split())

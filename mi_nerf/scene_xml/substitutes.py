@@ -7,6 +7,7 @@ of the same kind takes their place, with those of their properties that it knows
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable
 from typing import Any
 
@@ -62,6 +63,22 @@ def substitute(state: Any, kinds: Iterable[str]) -> list[str]:
     return list(dict.fromkeys(notes))  # once for all of several sensors
 
 
+def add_integrator(state: Any) -> list[str]:
+    """Adds what shows all that a scene holds, if there is no integrator; says so."""
+    import mitsuba as mi
+
+    if any(node.type == mi.ObjectType.Integrator for node in state.nodes):
+        return []
+    media = {n.props.plugin_name() for n in state.nodes if n.type == mi.ObjectType.Medium}
+    name = "nerf" if "nerfmedium" in media else "volpath" if media else "path"
+    node = mi.parser.SceneNode()
+    node.type = mi.ObjectType.Integrator
+    node.props = mi.Properties(name)
+    state.root.props["added_integrator"] = mi.Properties.ResolvedReference(len(state.nodes))
+    state.nodes.append(node)
+    return [f"no integrator in the scene, '{name}' is taken"]
+
+
 def _mend(state: Any, props: Any, kind: str, stand_in: str) -> list[str]:
     """Makes one plugin one that exists, if that is this task's business."""
     if kind == "Integrator":
@@ -70,7 +87,7 @@ def _mend(state: Any, props: Any, kind: str, stand_in: str) -> list[str]:
     known = _exists(name, kind)
     if known and kind == "Sensor":
         return []
-    found = _tried(props, name if known else stand_in, _KEPT[kind])
+    found = _tried(props, [name, stand_in] if known else [stand_in], _KEPT[kind])
     if found is None:  # loading the scene tells why
         return []
     name_now, left = found
@@ -79,8 +96,9 @@ def _mend(state: Any, props: Any, kind: str, stand_in: str) -> list[str]:
         del props[key]
     props.set_plugin_name(name_now)
     if name_now != name:
-        return [f"{_words(kind)} '{name}' does not exist in this Mitsuba, taken as '{name_now}'"]
-    return [f"{_words(kind)} '{name}': knows no {', '.join(gone)}, left out"] if gone else []
+        fault = "cannot be used here" if known else "does not exist in this Mitsuba"
+        return [f"{_words(kind)} '{name}' {fault}, taken as '{name_now}'"]
+    return [f"{_words(kind)} '{name}': {', '.join(gone)} not understood, left out"] if gone else []
 
 
 def _other_transport(state: Any, props: Any) -> list[str]:
@@ -105,13 +123,14 @@ def _other_transport(state: Any, props: Any) -> list[str]:
     return [f"integrator '{name}' does not exist in this Mitsuba, '{stand_in}' in its place"]
 
 
-def _tried(props: Any, name: str, kept: tuple[str, ...]) -> tuple[str, set[str]] | None:
-    """The properties with which a plugin of this name can be made; ``None`` if it cannot."""
+def _tried(props: Any, names: list[str], kept: tuple[str, ...]) -> tuple[str, set[str]] | None:
+    """The first of some plugins that can be made, and with which properties; or ``None``."""
     import mitsuba as mi
 
     manager = mi.PluginManager.instance()
     everything = _own(props)
-    for keys in (everything, [key for key in everything if key in kept]):
+    few = [key for key in everything if key in kept]
+    for name, keys in itertools.product(names, (everything, few)):
         trial = mi.Properties(props)
         for key in trial.keys():  # noqa: SIM118
             if key not in keys:

@@ -177,7 +177,7 @@ def _scene(path: Path) -> str:
         rows = {
             "scene": f"{path}, SHA-256 {file.digest()[:16]}...",
             "files": ", ".join(dict.fromkeys(found.name for found in file.files())),
-            "integrator": _plugins(file, "Integrator") or "none, path is taken",
+            "integrator": _plugins(file, "Integrator") or "none",
             "sensors": _counted(sensors) if file.plugins("Sensor") else "none",
             "emitters": _plugins(file, "Emitter") or "none",
             "shapes": _plugins(file, "Shape") or "none",

@@ -24,7 +24,8 @@ from ..cameras.trajectory import Poses, forward_spiral, orbit, orbit_like, spira
 from ..data import Dataset, held_out_split, load_dataset
 from ..images.write import on_white, write_picture
 from ..march.view import render_view
-from ..scene_xml.scene_file import SceneFile, refused_rendering
+from ..scene_xml.refusals import refused_rendering
+from ..scene_xml.scene_file import SceneFile
 from .target import Target, open_target
 
 Path_ = Literal["orbit", "spiral", "test"]
@@ -154,6 +155,7 @@ def scene_frames(
         with using_variant(variant):
             file = SceneFile(scene_path)
             file.substitute("Film")  # whose files are not written
+            file.complete()
             for note in file.notes:
                 print(note, flush=True)
             scene = file.load()

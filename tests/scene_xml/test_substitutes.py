@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mi_nerf.base.errors import InputError
+from mi_nerf.cli import main
 from mi_nerf.scene_xml.scene_file import SceneFile
 
 KINDS = ("Film", "Integrator", "ReconstructionFilter", "Sampler", "Sensor")
@@ -81,8 +82,29 @@ def test_unknown_properties_of_films(variant: str, tmp_path: Path) -> None:
     more = '<boolean name="attach_log" value="true"/><string name="pixel_format" value="rgba"/>'
     file = SceneFile(sensor(tmp_path, more_film=more))
     file.substitute("Film")
-    assert file.notes == ["film 'hdrfilm': knows no attach_log, left out"]
+    assert file.notes == ["film 'hdrfilm': attach_log not understood, left out"]
     assert mi.has_flag(file.load().sensors()[0].film().flags(), mi.FilmFlags.Alpha)
+
+
+def test_films_of_other_variants_and_wrong_values(variant: str, tmp_path: Path) -> None:
+    more = '<spectrum name="band" value="400:1, 500:0.5"/>'
+    file = SceneFile(sensor(tmp_path, film="specfilm", more_film=more))
+    file.substitute("Film")
+    assert file.notes == ["film 'specfilm' cannot be used here, taken as 'hdrfilm'"]
+    assert list(file.load().sensors()[0].film().size()) == [20, 10]
+    more = '<string name="pixel_format" value="rgb, luminance"/>'
+    file = SceneFile(sensor(tmp_path, more_film=more))
+    file.substitute("Film")
+    assert file.notes == ["film 'hdrfilm': pixel_format not understood, left out"]
+    assert list(file.load().sensors()[0].film().size()) == [20, 10]
+
+
+def test_films_that_scenes_refer_to(variant: str, tmp_path: Path) -> None:
+    content = """<film type="ldrfilm" id="f"><integer name="width" value="7"/></film>
+        <sensor type="perspective"><ref id="f"/></sensor><shape type="cube"/>"""
+    file = SceneFile(scene(tmp_path, content))
+    file.substitute("Film")
+    assert file.load().sensors()[0].film().size()[0] == 7
 
 
 @pytest.mark.parametrize("sampler", ["sobol", "halton", "hammersley"])
@@ -164,3 +186,50 @@ def test_what_matters_is_refused(variant: str, tmp_path: Path, content: str) -> 
     with pytest.raises(InputError) as refused:
         file.load()
     assert "\n" not in str(refused.value)
+
+
+def test_commands_say_what_was_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = sensor(tmp_path, film="ldrfilm", sampler="sobol")
+    path.write_text(path.read_text().replace("</scene>", '<emitter type="constant"/></scene>'))
+    film = "film 'ldrfilm' does not exist in this Mitsuba, taken as 'hdrfilm'"
+    sampler = "sampler 'sobol' does not exist in this Mitsuba, taken as 'independent'"
+    views = ["--train", "1", "--val", "0", "--test", "0", "--size", "8", "8", "--spp", "2"]
+    assert main(["generate", str(path), str(tmp_path / "data"), *views]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[:2] == [film, sampler] and "samples a pixel" in said[3]
+    assert main(["info", str(path)]) == 0
+    assert capsys.readouterr().out.splitlines()[-2:] == [film, sampler]
+    out = tmp_path / "picture.png"
+    assert main(["render", str(path), "-o", str(out)]) == 2  # it takes the sampler as it is
+    assert capsys.readouterr().err.count("\n") == 1
+    path.write_text(path.read_text().replace("sobol", "independent"))
+    assert main(["render", str(path), "-o", str(out), "--spp", "1"]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == film
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        ("", "path"),
+        ('<medium type="homogeneous" id="m"/>', "volpath"),
+        (
+            '<shape type="cube"><bsdf type="null"/><medium type="nerfmedium" name="interior">'
+            '<string name="field" value="shell"/></medium></shape>',
+            "nerf",
+        ),
+    ],
+)
+def test_a_scene_without_an_integrator(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], content: str, expected: str
+) -> None:
+    content += '<emitter type="constant"/><sensor type="perspective"/><shape type="sphere"/>'
+    path = scene(tmp_path, content)
+    size = ["--size", "6", "4", "--spp", "2"]
+    assert main(["render", str(path), "-o", str(tmp_path / "picture.png"), *size]) == 0
+    assert capsys.readouterr().out.splitlines()[0] == (
+        f"no integrator in the scene, '{expected}' is taken"
+    )
+    file = SceneFile(path)
+    file.complete()
+    file.complete()
+    assert len(file.notes) == 1 and len(file.plugins("Integrator")) == 1
