@@ -156,8 +156,6 @@ def scene_frames(
             file = SceneFile(scene_path)
             file.substitute("Film")  # whose files are not written
             file.complete()
-            for note in file.notes:
-                print(note, flush=True)
             scene = file.load()
             sensors = scene.sensors()
             if not sensors:
@@ -165,6 +163,8 @@ def scene_frames(
             if path == "test":
                 expected = "{}: a scene has no test views, expected {} or {}"
                 raise InputError(expected, scene_path, *_MOVING)
+            for note in file.notes:
+                print(note, flush=True)
             if size is not None:
                 for sensor in sensors:
                     film = mi.traverse(sensor)
