@@ -65,14 +65,16 @@ def _properties(state: Any) -> Iterator[tuple[str, Any]]:
 
 def _told(value: Any) -> Any:
     """A value as JSON knows it, the same on every machine; ``None`` for references."""
+    import mitsuba as mi
+
     if isinstance(value, bool | int | float | str):
         return value
+    if isinstance(value, mi.Properties.Reference | mi.Properties.ResolvedReference):
+        return None
     if hasattr(value, "wavelengths"):
         return [list(value.wavelengths), list(value.values)]
     if hasattr(value, "matrix"):
         return [f"{number:.{_DIGITS}g}" for number in np.ravel(value.matrix)]
-    if hasattr(value, "index") or hasattr(value, "id"):
-        return None
     return [float(number) for number in value]  # a vector or a colour
 
 

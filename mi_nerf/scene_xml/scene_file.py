@@ -53,9 +53,9 @@ class SceneFile:
                 raise InputError(f"{path}: expected <scene> as the outermost element")
             mi.parser.transform_upgrade(self._config, parsed)
             mi.parser.transform_resolve(self._config, parsed)
-        _tell_names(parsed)
-        if "spectral" not in mi.variant():
-            self.notes += spectra_as_values(parsed)
+            _tell_names(parsed)
+            if "spectral" not in mi.variant():
+                self.notes += spectra_as_values(parsed)
         self._state = parsed
 
     def default(self, name: str) -> str | None:

@@ -15,7 +15,9 @@ import numpy as np
 from .instancing import children
 
 _LIGHT_SPEED, _PLANCK, _BOLTZMANN = 299792458.0, 6.62607015e-34, 1.380649e-23  # SI
-_VISIBLE = np.arange(360.0, 831.0, 5.0)  # nm
+_VISIBLE = 360.0, 830.0  # nm
+_STEPS = 95
+_RANGE = "wavelength_min", "wavelength_max"
 
 Array = np.ndarray[Any, Any]
 Values = tuple[Array, Array]
@@ -60,14 +62,17 @@ def planck(wavelengths: Array, temperature: float) -> Array:
 def _values(props: Any) -> Values | None:
     """Wavelengths and values of a plugin that is a spectrum; ``None`` if Mitsuba shall judge it."""
     name, keys = props.plugin_name(), set(props.keys())
-    if name == "blackbody" and keys == {"temperature"}:
-        return _VISIBLE, planck(_VISIBLE, float(props["temperature"]))
+    if name == "blackbody" and "temperature" in keys <= {"temperature", *_RANGE}:
+        given = [float(props.get(key, end)) for key, end in zip(_RANGE, _VISIBLE, strict=True)]
+        first, last = np.clip(given, *_VISIBLE).tolist()
+        wavelengths = np.linspace(first, last, _STEPS)
+        return wavelengths, planck(wavelengths, float(props["temperature"]))
     if name == "irregular" and keys == {"wavelengths", "values"}:
         return _paired(_numbers(props["wavelengths"]), _numbers(props["values"]))
-    if name == "regular" and keys == {"wavelength_min", "wavelength_max", "values"}:
+    if name == "regular" and keys == {"values", *_RANGE}:
         values = _numbers(props["values"])
-        ends = float(props["wavelength_min"]), float(props["wavelength_max"])
-        return None if values is None else _paired(np.linspace(*ends, len(values)), values)
+        first, last = (float(props[key]) for key in _RANGE)
+        return None if values is None else _paired(np.linspace(first, last, len(values)), values)
     return None
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from tests.support import gallery
 CONTENT = """<default name="size" value="0.4"/><path value="spectra"/>
     <include filename="parts/ball.xml"/><include filename="parts/defaults.xml"/>
     <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
-    <emitter type="point"><spectrum name="intensity" filename="gold.k.spd"/></emitter>
+    <emitter type="point"><point name="position" value="$x 0 $x"/><spectrum name="intensity" filename="gold.k.spd"/></emitter>
     <shape type="obj"><string name="filename" value="wedge.obj"/><bsdf type="diffuse">
         <texture type="bitmap" name="reflectance">
             <string name="filename" value="textures/paint.png"/></texture></bsdf></shape>
@@ -26,7 +27,10 @@ CONTENT = """<default name="size" value="0.4"/><path value="spectra"/>
     <shape type="cube"><bsdf type="null"/><medium name="interior" type="heterogeneous">
         <volume name="sigma_t" type="gridvolume"><string name="filename" value="blob.vol"/></volume>
         <float name="scale" value="$thickness"/></medium></shape>
-    <shape type="bsplinecurve"><string name="filename" value="curls.txt"/></shape>"""
+    <shape type="bsplinecurve"><string name="filename" value="curls.txt"/><bsdf type="diffuse">
+        <rgb name="reflectance" value="0.5 $tint 0.5"/></bsdf></shape>
+    <shape type="cube"><transform name="to_world"><rotate z="1" angle="$turn"/></transform></shape>
+    """
 
 
 @pytest.fixture
@@ -35,7 +39,8 @@ def scene(tmp_path: Path) -> Path:
     folder.mkdir()
     gallery.write_assets(folder)
     (folder / "parts/defaults.xml").write_text(
-        '<scene version="3.0.0"><default name="thickness" value="2"/></scene>'
+        '<scene version="3.0.0"><default name="thickness" value="2"/><default name="x" value="7"/>'
+        '<default name="turn" value="9"/><default name="tint" value="0.6"/></scene>'
     )
     path = folder / "scene.xml"
     path.write_text(f'<scene version="3.0.0">{CONTENT}</scene>')
@@ -50,6 +55,10 @@ def appended(path: Path) -> None:
     path.write_bytes(path.read_bytes() + b"\n ")
 
 
+def replaced(path: Path, old: str, new: str) -> None:
+    path.write_text(path.read_text().replace(f'"{old}"', f'"{new}"'))
+
+
 def other_number(path: Path) -> None:
     path.write_text(path.read_text().replace("3", "4"))
 
@@ -59,7 +68,10 @@ def other_number(path: Path) -> None:
     [
         ("scene.xml", appended),
         ("parts/ball.xml", appended),
-        ("parts/defaults.xml", lambda p: p.write_text(p.read_text().replace('"2"', '"3"'))),
+        *(
+            ("parts/defaults.xml", partial(replaced, old=old, new=new))
+            for old, new in (("2", "3"), ("7", "8"), ("9", "10"), ("0.6", "0.61"))
+        ),
         ("sky.exr", appended),
         ("textures/paint.png", appended),
         ("wedge.obj", appended),

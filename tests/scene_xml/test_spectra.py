@@ -78,6 +78,14 @@ def test_a_black_body_has_the_colour_that_it_has_in_spectral_light(tmp_path: Pat
     assert found[0] > found[1] > found[2] > 0  # 4000 K is reddish
 
 
+def test_a_black_body_behind_a_filter(variant: str, tmp_path: Path) -> None:
+    """Only the red end of it."""
+    end = '<float name="wavelength_min" value="620"/></spectrum>'
+    filtered = BLACK_BODY.replace("</spectrum>", end).format(name="radiance")
+    found = picture(scene(tmp_path, filtered, "radiance"))[0, 0]
+    assert found[0] > 3 * np.abs(found[1:]).max()
+
+
 @given(st.floats(500, 20000), st.floats(300, 900))
 def test_planck_against_the_displacement_and_the_ratio(temperature: float, at: float) -> None:
     """Wien's displacement in closed form, and L(λ, T) = L(aλ, T/a) · a⁵."""
@@ -103,6 +111,7 @@ def test_the_power_of_a_black_body() -> None:
         '<string name="wavelengths" value="400, a"/><string name="values" value="1, 2"/>',
         '<string name="wavelengths" value="400, 500"/><string name="values" value="1"/>',
         '<string name="wavelengths" value="400, 500"/>',
+        '<string name="wavelengths" value="500, 400"/><string name="values" value="1, 2"/>',
     ],
 )
 def test_what_mitsuba_refuses(variant: str, tmp_path: Path, wrong: str) -> None:
