@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from ..base.machine import versions
 from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
 from ..scene_xml.scene_file import SceneFile, visible_bounds
+from ..scene_xml.scene_file import quiet as _quiet
 from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View, make_plan, protocol_name
 from .protocol import SPLITS, Options
@@ -72,7 +72,7 @@ def generate(
         if resume and (folder / RECORD).exists():
             record["views"] = _resumed_views(folder, record, plan)
         if show:
-            print(plan, flush=True)
+            print(*file.notes, plan, sep="\n", flush=True)
         return _trace_views(folder, tracer, plan, record, show)
 
 
@@ -111,23 +111,12 @@ def _check_output(folder: Path, resume: bool) -> None:
         raise InputError(f"{folder}: holds no {RECORD}, expected a dataset begun by generate")
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without Mitsuba's warnings about sensors and samplers that are replaced anyway."""
-    import mitsuba as mi
-
-    level = mi.log_level()
-    mi.set_log_level(mi.LogLevel.Error)
-    try:
-        yield
-    finally:
-        mi.set_log_level(level)
-
-
 def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
     """Loads the scene and decides what to make of it."""
     import mitsuba as mi
 
+    file.substitute("Film", "Integrator", "ReconstructionFilter", "Sampler", "Sensor")
+    file.complete()
     hide = protocol_name(file, options) != "forward"
     integrators = file.plugins("Integrator")
     if hide:

@@ -11,6 +11,7 @@ from ..base.arrays import Image
 from ..base.errors import InputError
 from ..cameras.pinhole import sensor_dict
 from ..cameras.poses import mitsuba_from_opengl
+from ..scene_xml.refusals import refused_rendering
 from .plan import Plan, View
 from .surfaces import trace_surfaces
 
@@ -92,6 +93,8 @@ class Tracer:
         except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
             if isinstance(error.__cause__, InputError):
                 raise error.__cause__ from error
+            if (said := refused_rendering(error)) is not None:
+                raise InputError(said) from error
             raise
 
 

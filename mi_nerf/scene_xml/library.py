@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 from ..base.errors import InputError
@@ -23,14 +24,16 @@ def find_scene(name: str) -> Path:
     Raises:
         InputError: if there is neither, with the names there are.
     """
-    if Path(name).suffix == ".xml":
-        if Path(name).is_file():
-            return Path(name)
-        raise InputError(f"{name}: not found, expected a Mitsuba XML scene")
     known = scenes()
-    if name not in known:
-        raise InputError(f"scene '{name}': unknown, expected an .xml file or {', '.join(known)}")
-    return known[name]
+    if os.path.isfile(name):
+        return Path(name)
+    if name in known:
+        return known[name]
+    if os.path.isdir(name):
+        raise InputError(f"{name}: is a folder, expected a Mitsuba XML scene")
+    if Path(name).suffix.lower() == ".xml":
+        raise InputError(f"{name}: not found, expected a Mitsuba XML scene")
+    raise InputError(f"scene '{name}': unknown, expected an .xml file or {', '.join(known)}")
 
 
 def scenes() -> dict[str, Path]:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,14 +13,22 @@ import numpy as np
 
 from ..base.errors import InputError
 from .instancing import copy_instances
-
-_ASKED = "mi_nerf_asked"  # the id of a shape in a scene that is parsed, never loaded
+from .provenance import digest, files_of
+from .refusals import check_file, refusal
+from .spectra import spectra_as_values
+from .substitutes import add_integrator, substitute
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 
 
 class SceneFile:
     """A parsed scene that is not loaded yet. A Mitsuba variant must be set.
+
+    It is brought up to the present version of Mitsuba's format before anything is read or
+    changed, so names are those of today: ``to_world``, ``hide_emitters``.
+
+    Attributes:
+        notes: What was replaced by what, a line each.
 
     Raises:
         InputError: if the file is missing, or Mitsuba cannot parse it.
@@ -33,13 +40,23 @@ class SceneFile:
 
         self.path = Path(path)
         self.parameters = dict(parameters or {})
-        if not self.path.is_file():
-            raise InputError(f"{path}: not found, expected a Mitsuba XML scene")
+        self.notes: list[str] = []
+        check_file(self.path)
+        self._absolute = Path(os.path.abspath(self.path))
+        # Beside the file, or beside what it is a link to; then what its <path>s add.
+        self._folders = [str(self._absolute.parent), str(self.path.resolve().parent)]
         self._config = mi.parser.ParserConfig(mi.variant())
-        with self._one_line_errors(), self._beside_the_file():
-            self._state = mi.parser.parse_file(self._config, str(self.path), **self.parameters)
-        if self._state.root.type != mi.ObjectType.Scene:
-            raise InputError(f"{path}: expected <scene> as the outermost element")
+        with self._one_line_errors(), self._search_path():
+            parsed = mi.parser.parse_file(self._config, str(self._absolute), **self.parameters)
+            self._as_parsed = mi.parser.ParserState(parsed)
+            if parsed.root.type != mi.ObjectType.Scene:
+                raise InputError(f"{path}: expected <scene> as the outermost element")
+            mi.parser.transform_upgrade(self._config, parsed)
+            mi.parser.transform_resolve(self._config, parsed)
+            _tell_names(parsed)
+            if "spectral" not in mi.variant():
+                self.notes += spectra_as_values(parsed)
+        self._state = parsed
 
     def default(self, name: str) -> str | None:
         """The value of a ``$parameter``: as given, or by the file's own ``<default>``."""
@@ -49,16 +66,17 @@ class SceneFile:
             return self.parameters[name]
         # Mitsuba's parser takes much that is no XML, and does not tell defaults: it is asked what
         # it puts for the parameter in a scene that includes the file. The first default counts.
+        file = quoteattr(str(self._absolute).replace("$", "\\$"))
         asking = (
-            f'<scene version="3.0.0"><include filename={quoteattr(self.path.name)}/>'
+            f'<scene version="3.0.0"><include filename={file}/>'
             f'<default name="{name}" value=""/>'
-            f'<shape type="cube" id="{_ASKED}"><string name="value" value="${name}"/></shape>'
-            "</scene>"
+            f'<shape type="cube"><string name="value" value="${name}"/></shape></scene>'
         )
-        with self._one_line_errors(), self._beside_the_file():
-            state = mi.parser.parse_string(self._config, asking, **self.parameters)
-        shape = state.nodes[state.id_to_index[_ASKED]].props
-        return str(shape["value"]) or None
+        config = mi.parser.ParserConfig(self._config.variant)
+        config.max_include_depth += 1
+        with self._one_line_errors(), self._search_path():
+            state = mi.parser.parse_string(config, asking, **self.parameters)
+        return str(state.nodes[len(state.nodes) - 1].props["value"]) or None
 
     def plugins(self, kind: str) -> list[Any]:
         """The properties of all plugins of a kind, such as ``"Sensor"``."""
@@ -67,67 +85,100 @@ class SceneFile:
         wanted = getattr(mi.ObjectType, kind)
         return [node.props for node in self._state.nodes if node.type == wanted]
 
-    def load(self) -> Any:
+    def substitute(self, *kinds: str) -> None:
+        """Replaces plugins of kinds that do not matter here, where Mitsuba does not know them.
+
+        What was replaced is added to ``notes``. See :func:`.substitutes.substitute`.
+        """
+        self.notes += substitute(self._state, kinds)
+
+    def complete(self) -> None:
+        """Gives a scene that has no integrator the usual one, which is added to ``notes``."""
+        self.notes += add_integrator(self._state)
+
+    @property
+    def state(self) -> Any:
+        """What Mitsuba's parser found, upgraded and resolved; changes count for the next load."""
+        return self._state
+
+    def load(self, *, merge: bool = True) -> Any:
         """Creates the scene.
+
+        Args:
+            merge: Meshes of one material become one, which renders faster.
 
         Raises:
             InputError: with what Mitsuba says, if it refuses.
         """
         import mitsuba as mi
 
-        with self._one_line_errors(), self._beside_the_file():
-            mi.parser.transform_resolve(self._config, self._state)
-            copy_instances(self._state)
-            mi.parser.transform_all(self._config, self._state)
-            scene = mi.parser.instantiate(self._config, self._state)
+        state = mi.parser.ParserState(self._state)
+        with self._one_line_errors(), self._search_path():
+            copy_instances(state)
+            mi.parser.transform_merge_equivalent(self._config, state)
+            if merge:
+                mi.parser.transform_merge_meshes(self._config, state)
+            scene = mi.parser.instantiate(self._config, state)
         return scene[0] if isinstance(scene, list) else scene
 
-    def digest(self) -> str:
-        """SHA-256 of the scene: its XML, parameters, and the files that it names."""
-        import mitsuba as mi
+    def files(self) -> list[Path]:
+        """The XML files and what they name, but for spectra; see :func:`.provenance.files_of`."""
+        with self._one_line_errors(), self._search_path():
+            return files_of(self._as_parsed)
 
-        total = hashlib.sha256()
-        for name, value in sorted(self.parameters.items()):
-            total.update(f"{name}={value}\n".encode())
-        files = [Path(str(file)) for file in self._state.files]
-        with self._beside_the_file():
-            for node in self._state.nodes:
-                if "filename" in node.props:
-                    files.append(Path(str(mi.file_resolver().resolve(node.props["filename"]))))
-        for file in files:
-            try:
-                total.update(hashlib.sha256(file.read_bytes()).digest())
-            except OSError as error:
-                raise InputError(
-                    f"{self.path}: {file}: cannot be read: {error.strerror}"
-                ) from error
-        return total.hexdigest()
+    def digest(self) -> str:
+        """SHA-256 of the scene: its XML, parameters, and the files that it reads."""
+        with self._one_line_errors(), self._search_path():
+            return digest(self._as_parsed, self.parameters)
 
     @contextmanager
     def _one_line_errors(self) -> Iterator[None]:
         """Says in one line what Mitsuba refuses; a fault of a Python plugin comes as it is."""
         try:
             yield
+        except UnicodeDecodeError as error:  # in a name that Mitsuba wants to tell
+            raise InputError(
+                f"{self.path}: holds bytes that are no UTF-8, expected that or another encoding "
+                "declared in its first line"
+            ) from error
         except RuntimeError as error:  # for all that can be wrong, what plugins raise included
-            message = _refusal(str(error))
+            message = refusal(str(error))
             if message is None:
                 raise
+            message = message.replace(str(self._absolute), self.path.name)
             raise InputError(f"{self.path}: Mitsuba cannot load this scene: {message}") from error
 
     @contextmanager
-    def _beside_the_file(self) -> Iterator[None]:
-        """Relative names in the scene are looked up beside it first."""
+    def _search_path(self) -> Iterator[None]:
+        """Relative names in the scene are looked up in its own folders first."""
         import mitsuba as mi
 
         resolver = mi.file_resolver()
         before = [str(folder) for folder in resolver]
-        resolver.prepend(str(self.path.resolve().parent))
+        resolver.clear()
+        for folder in (*self._folders, *before):
+            resolver.append(folder)
         try:
             yield
         finally:
+            folders = [str(folder) for folder in resolver]
+            self._folders = folders[: len(folders) - len(before)]
             resolver.clear()
             for folder in before:
                 resolver.append(folder)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without Mitsuba's warnings about sensors and samplers that are replaced anyway."""
+    import mitsuba as mi
+
+    level = mi.log_level()
+    mi.set_log_level(mi.LogLevel.Error)
+    try:
+        yield
+    finally:
+        mi.set_log_level(level)
 
 
 def visible_bounds(scene: Any) -> Bounds | None:
@@ -146,16 +197,10 @@ def visible_bounds(scene: Any) -> Bounds | None:
     return tuple(lower.tolist()), tuple(upper.tolist())
 
 
-def _refusal(message: str) -> str | None:
-    """What Mitsuba says, in one line; None if a Python plugin failed by a fault of its own.
-
-    An exception of a plugin comes as the text of its traceback. Plugins of mi_nerf refuse by
-    InputError, those of Mitsuba and others by a plain Exception.
-    """
-    before, found, traceback = message.partition("Traceback (most recent call last):")
-    if found:
-        said = re.search(r"^(?:[\w.]+\.)?(\w+): (.*)", traceback, re.MULTILINE | re.DOTALL)
-        if said is None or said[1] not in ("InputError", "Exception", "RuntimeError"):
-            return None
-        message = before + said[2]
-    return " ".join(message.split())
+def _tell_names(state: Any) -> None:
+    """Gives objects whose names are in no known encoding others, which Python can tell."""
+    for i, node in enumerate(state.nodes):
+        try:
+            node.props.id()
+        except UnicodeDecodeError:
+            node.props.set_id(f"unnamed_{i}")

@@ -1,8 +1,9 @@
-"""Summaries for people: the system, runs, field files, checkpoints, datasets."""
+"""Summaries for people: the system, runs, field files, checkpoints, datasets, scenes."""
 
 from __future__ import annotations
 
 import os
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -10,11 +11,12 @@ from ..base.errors import InputError
 from ..base.files import read_json
 from ..base.machine import versions
 from ..base.tensor_file import read_metadata
-from ..base.variants import available_variants
+from ..base.variants import available_variants, choose_variant, using_variant
 from ..data import available_splits, load_dataset
 from ..fields.hash_grid import HashGridConfig
 from ..formats.field_file import FieldFile, load_field
 from ..generation.run import RECORD, ceilings
+from ..scene_xml.scene_file import SceneFile, quiet, visible_bounds
 from ..training.auto import Decision
 from ..training.checkpoint import read_checkpoint
 from ..training.run_folder import CHECKPOINT, CONFIG, FIELD, read_record
@@ -34,7 +36,7 @@ def system() -> str:
 
 
 def describe(target: str | Path | None = None) -> str:
-    """What this machine offers, or what a run, checkpoint, field or dataset holds.
+    """What this machine offers, or what a run, checkpoint, field, dataset or scene holds.
 
     Raises:
         InputError: if the target is nothing that mi_nerf knows.
@@ -44,10 +46,13 @@ def describe(target: str | Path | None = None) -> str:
     path = Path(target)
     if not path.exists():
         raise InputError(
-            f"{path}: not found, expected a run, a .safetensors file or a dataset folder"
+            f"{path}: not found, expected a run, a .safetensors file, a dataset folder "
+            "or an XML scene"
         )
     if path.is_dir():
         return _run(path) if (path / CONFIG).exists() else _dataset(path)
+    if path.suffix.lower() == ".xml":
+        return _scene(path)
     kind = read_metadata(path).get("format", "")
     if kind == "mi_nerf.field":
         return _table(_field_rows(path, load_field(path)))
@@ -159,6 +164,47 @@ def _provenance(folder: Path) -> dict[str, str]:
         }
     except (KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{folder / RECORD}: damaged record of a dataset: {error!r}") from error
+
+
+def _scene(path: Path) -> str:
+    """A Mitsuba scene, as ``generate`` would take it."""
+    with using_variant(choose_variant()), quiet():
+        file = SceneFile(path)
+        file.substitute("Film", "Integrator", "ReconstructionFilter", "Sampler", "Sensor")
+        scene = file.load()
+        box = visible_bounds(scene)
+        sensors = Counter(_sensor(sensor) for sensor in scene.sensors())
+        rows = {
+            "scene": f"{path}, SHA-256 {file.digest()[:16]}...",
+            "files": ", ".join(dict.fromkeys(found.name for found in file.files())),
+            "integrator": _plugins(file, "Integrator") or "none",
+            "sensors": _counted(sensors) if file.plugins("Sensor") else "none",
+            "emitters": _plugins(file, "Emitter") or "none",
+            "shapes": _plugins(file, "Shape") or "none",
+            "media": _plugins(file, "Medium"),
+            "box": "nothing to be seen"
+            if box is None
+            else f"{_corner(box[0])} to {_corner(box[1])}",
+            "asks for": ", ".join(
+                f"{name} {value}"
+                for name in ("protocol", "cameras")
+                if (value := file.default(name)) is not None
+            ),
+        }
+        return "\n".join([_table({k: v for k, v in rows.items() if v}), *file.notes])
+
+
+def _plugins(file: SceneFile, kind: str) -> str:
+    return _counted(Counter(props.plugin_name() for props in file.plugins(kind)))
+
+
+def _counted(names: Counter[str]) -> str:
+    return ", ".join(f"{count} {name}" if count > 1 else name for name, count in names.items())
+
+
+def _sensor(sensor: Any) -> str:
+    width, height = sensor.film().size()
+    return f"{sensor.class_name()} of {width}x{height}, {sensor.sampler().sample_count()} samples"
 
 
 def _corner(v: tuple[float, float, float]) -> str:

@@ -23,6 +23,7 @@ from ..cameras.trajectory import Poses, forward_spiral, orbit, orbit_like, spira
 from ..data import Dataset, held_out_split, load_dataset
 from ..images.write import on_white, write_picture
 from ..march.view import linear_premultiplied, render_view
+from ..scene_xml.refusals import refused_rendering
 from ..scene_xml.scene_file import SceneFile
 from .target import Target, open_target
 
@@ -144,18 +145,25 @@ def scene_frames(
         except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
             if isinstance(error.__cause__, InputError):
                 raise InputError(f"{scene_path}: {error.__cause__}") from error
+            if (said := refused_rendering(error)) is not None:
+                raise InputError(f"{scene_path}: {said}") from error
             raise
 
     def produce() -> Generator[Any, None, None]:
         """The number of frames, and then these."""
         with using_variant(variant):
-            scene = SceneFile(scene_path).load()
+            file = SceneFile(scene_path)
+            file.substitute("Film")  # whose files are not written
+            file.complete()
+            scene = file.load()
             sensors = scene.sensors()
             if not sensors:
                 raise InputError(f"{scene_path}: has no sensor, expected at least one")
             if path == "test":
                 expected = "{}: a scene has no test views, expected {} or {}"
                 raise InputError(expected, scene_path, *_MOVING)
+            for note in file.notes:
+                print(note, flush=True)
             if size is not None:
                 for sensor in sensors:
                     film = mi.traverse(sensor)

@@ -584,7 +584,7 @@ def test_a_folder_that_is_no_run(
     [
         ("eval", "not found, expected a run folder or a field file"),
         ("render", "not found, expected a run folder or a Mitsuba XML scene"),
-        ("info", "not found, expected a run, a .safetensors file or a dataset folder"),
+        ("info", "not found, expected a run, a .safetensors file, a dataset folder or an XML"),
     ],
 )
 def test_nothing_there(command: str, said: str, refused: Refused, tmp_path: Path) -> None:
