@@ -533,8 +533,11 @@ def land() -> tuple[Array, Array, Array]:
     return points, faces, points[:, :2] / 1200 + 0.5
 
 
-def mountains(number: int) -> tuple[Array, Array, Array]:
-    """A range all around, 0 the nearer: points, faces and uv, v from its foot to its crest."""
+def mountains(number: int) -> tuple[Array, Array, Array, Array]:
+    """A range all around, 0 the nearer: points, faces, normals and uv, v from foot to crest.
+
+    Normals point up more than the surface does: haze shines from within.
+    """
     distance, top, seed = ((760.0, 50.0, 11), (1150.0, 165.0, 17))[number]
     columns = 200
     angle = np.linspace(0, 2 * np.pi, columns + 1)
@@ -545,8 +548,10 @@ def mountains(number: int) -> tuple[Array, Array, Array]:
     away = distance * (1 + 0.1 * v + 0.02 * waves(25 * x, 25 * y + 3 * v, seed + 4) * (1 - v))
     z = -60 + (crest + 60) * v
     points = np.stack(np.broadcast_arrays(away * x, away * y, z), -1).reshape(-1, 3)
+    turned = 0.35 * waves(31 * x, 31 * y + 2 * v, seed + 5)
+    normals = np.stack(np.broadcast_arrays(-x - turned * y, -y + turned * x, 2.6 + 0 * v), -1)
     uv = np.stack(np.broadcast_arrays(6 * angle / np.pi, v), -1).reshape(-1, 2)
-    return points, grid_faces(4, columns + 1), uv
+    return points, grid_faces(4, columns + 1), normals.reshape(-1, 3), uv
 
 
 def cypress(rng: np.random.Generator) -> tuple[Array, ...]:
@@ -892,8 +897,9 @@ def write_surroundings(folder: Path) -> None:
     points, faces, uv = land()
     write_ply(folder / "courtyard_land.ply", points, faces, uv=uv)
     for number in range(2):
-        points, faces, uv = mountains(number)
-        write_ply(folder / f"courtyard_mountains_{number}.ply", points, faces, uv=uv)
+        points, faces, normals, uv = mountains(number)
+        path = folder / f"courtyard_mountains_{number}.ply"
+        write_ply(path, points, faces, normals=normals, uv=uv)
     for name, solid in zip(("house", "roof", "tower", "spire"), (*house(), *tower()), strict=True):
         write_solid(folder / f"courtyard_{name}.ply", solid)
 
