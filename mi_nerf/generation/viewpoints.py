@@ -18,6 +18,7 @@ Array = np.ndarray[Any, Any]
 
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
 _STEP = np.array([1 / _PLASTIC, 1 / _PLASTIC**2])
+_STEP_3 = 1.22074408460575947536 ** -np.arange(1.0, 4)  # the real root of x^4 = x + 1
 
 # Sines of elevation. Not quite the pole, where "upright" means nothing, nor quite the
 # horizon, where a ground plane is a line.
@@ -31,6 +32,12 @@ def unit_square(count: int, seed: int, stream: int) -> Array:
     """``count`` points of the R2 sequence in [0, 1)², (count, 2)."""
     start = np.random.default_rng([seed, stream]).random(2)
     return (start + np.arange(count)[:, None] * _STEP) % 1.0
+
+
+def unit_cube(count: int, seed: int, stream: int, first: int = 0) -> Array:
+    """``count`` points of the R3 sequence in [0, 1)³, (count, 3), from number ``first`` on."""
+    start = np.random.default_rng([seed, stream]).random(3)
+    return (start + np.arange(first, first + count)[:, None] * _STEP_3) % 1.0
 
 
 def around(
@@ -81,6 +88,6 @@ def horizontal_axes(up: Array) -> tuple[Array, Array]:
     """Two unit vectors that make a right-handed frame with ``up``: side, front, up."""
     side = np.cross(up, [0.0, 0.0, 1.0])
     if np.linalg.norm(side) < 0.5:
-        side = np.array([1.0, 0.0, 0.0])
+        side = np.array([1.0, 0.0, 0.0]) - up[0] * np.asarray(up)
     side /= np.linalg.norm(side)
     return side, np.cross(up, side)

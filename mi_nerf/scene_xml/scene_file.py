@@ -67,14 +67,23 @@ class SceneFile:
         wanted = getattr(mi.ObjectType, kind)
         return [node.props for node in self._state.nodes if node.type == wanted]
 
-    def load(self) -> Any:
+    @property
+    def state(self) -> Any:
+        """What Mitsuba's parser found; it may be changed until the scene is loaded."""
+        return self._state
+
+    def load(self, *, merge: bool = True) -> Any:
         """Creates the scene.
+
+        Args:
+            merge: Meshes of one material become one, which renders faster.
 
         Raises:
             InputError: with what Mitsuba says, if it refuses.
         """
         import mitsuba as mi
 
+        self._config.merge_meshes = merge
         with self._one_line_errors(), self._beside_the_file():
             mi.parser.transform_resolve(self._config, self._state)
             copy_instances(self._state)
