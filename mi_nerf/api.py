@@ -52,6 +52,7 @@ def generate(
     up: str | tuple[float, float, float] | None = None,
     center: tuple[float, float, float] | None = None,
     radius: float | None = None,
+    elevation: tuple[float, float] | None = None,
     object: str | Sequence[str] | None = None,
     parameters: Mapping[str, str] | None = None,
     resume: bool = False,
@@ -71,6 +72,7 @@ def generate(
         seed: of camera positions and of the noise.
         cameras, center, radius: where 360-degree cameras stand, in scene units; ``"scene"``
             takes the scene's own sensors.
+        elevation: between which angles over the horizon of ``center``, in degrees.
         up: vertical axis, ``"y"`` or ``"-z"``, or direction; default: as the scene's sensor or
             its base shows.
         object: ids of the shapes that cameras look at; default: all but what surrounds them.
@@ -104,6 +106,7 @@ def generate(
         up=up,
         center=center,
         radius=radius,
+        elevation=elevation,
         object=(object,) if isinstance(object, str) else tuple(object or ()) or None,
     )
     path = find_scene(str(scene))

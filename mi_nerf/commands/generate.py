@@ -65,6 +65,8 @@ class Generate:
     """What cameras look at; default: the origin, or the middle of objects beyond [-1, 1]^3."""
     radius: float | None = None
     """Distance from it (forward: how far cameras move); default: 4, or as the scene's size says."""
+    elevation: tuple[float, float] | None = None
+    """Lowest and highest angle of 360-degree cameras over its horizon, degrees; default: all."""
     plan: bool = False
     """Only draw the cameras: OUT/cameras.png, or OUT if it ends so; renders nothing."""
     set: UseAppendAction[tuple[str, ...]] = ()

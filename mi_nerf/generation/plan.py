@@ -57,6 +57,7 @@ class Plan:
     up: tuple[float, float, float]
     center: tuple[float, float, float]  # what the cameras look at; forward: where they are
     radius: float  # their distance from it; forward: how far they move from it
+    elevation: tuple[float, float] | None  # between which angles they stand; None: all of them
     hide_emitters: bool  # objects are seen before nothing, other scenes before their sky
     subject: Subject  # what of the scene is the object
     survey: Survey = field(compare=False, repr=False)  # what the cameras will see
@@ -127,6 +128,7 @@ class Plan:
             "up": list(self.up),
             "center": list(self.center),
             "radius": self.radius,
+            **({} if self.elevation is None else {"elevation": list(self.elevation)}),
         }
         return {**record, **self.subject.record()}
 

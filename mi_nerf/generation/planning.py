@@ -60,6 +60,7 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
         up=_triple(up),
         center=_triple(choice.shots.center),
         radius=choice.shots.radius,
+        elevation=options.elevation,
         hide_emitters=choice.survey.hide_emitters,
         subject=choice.subject,
         survey=choice.survey,

@@ -52,4 +52,5 @@ class Options:
     up: str | tuple[float, float, float] | None = None
     center: tuple[float, float, float] | None = None  # what the cameras look at
     radius: float | None = None  # their distance from it; forward: how far they move sideways
+    elevation: tuple[float, float] | None = None  # of 360-degree cameras over its horizon, degrees
     object: tuple[str, ...] | None = None  # the shapes that cameras look at; found by size

@@ -21,6 +21,7 @@ from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
 from ..scene_xml.scene_file import Bounds, SceneFile, visible_bounds
 from ..scene_xml.sensors import separate_sensors
+from .hints import with_hints
 from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View
 from .plan_picture import PICTURE, draw
@@ -186,6 +187,7 @@ def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
 
 def _plan(file: SceneFile, options: Options) -> tuple[SceneFile, Any, Plan]:
     """The file as it was loaded, its scene, and what to make of it."""
+    options = with_hints(file, options)
     hide = protocol_name(file, options) not in ("forward", "room")
     notes, scene, box = _load(file, hide)
     plan = make_plan(file, scene, box, options)

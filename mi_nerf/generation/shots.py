@@ -70,7 +70,14 @@ def around(
     views = []
     for split, count in counts.items():
         poses = viewpoints.around(
-            count, split, options.seed, cameras=sphere, up=up, center=center, radius=radius
+            count,
+            split,
+            options.seed,
+            cameras=sphere,
+            up=up,
+            center=center,
+            radius=radius,
+            elevation=_elevation(options),
         )
         views += [View(split, i, pose, options.seed) for i, pose in enumerate(poses)]
     intrinsics = Intrinsics.from_angle_x(*size, CAMERA_ANGLE_X)
@@ -92,6 +99,18 @@ def _center_and_radius(box: Bounds, options: Options) -> tuple[Array, float]:
     return center, positive("radius", radius)
 
 
+def _elevation(options: Options) -> tuple[float, float] | None:
+    """Between which angles the cameras stand, checked: straight up there is no upright."""
+    if options.elevation is not None:
+        low, high = options.elevation
+        if not -90 < low <= high < 90:
+            raise InputError(
+                "{}: expected two angles between -90 and 90 degrees, the lower one first",
+                Option("elevation", options.elevation),
+            )
+    return options.elevation
+
+
 # ---- Beside the scene's sensor -----------------------------------------------
 
 
@@ -106,7 +125,7 @@ def forward(
     options: Options,
 ) -> Shots:
     """Cameras beside the scene's own, all looking the same way."""
-    refuse(options, "the protocol 'forward'", "cameras", "center", "object")
+    refuse(options, "the protocol 'forward'", "cameras", "center", "elevation", "object")
     pose, angle = _own_camera(sensor, box, up)
     intrinsics = Intrinsics.from_angle_x(*size, angle)
     spread = options.radius
@@ -175,7 +194,7 @@ def inside(
     Args:
         box: Of all that is visible.
     """
-    refuse(options, "the protocol 'room'", "cameras", "center", "radius", "object")
+    refuse(options, "the protocol 'room'", "cameras", "center", "radius", "elevation", "object")
     start = None if sensor is None else sensor.pose[:3, 3]
     room = find_room(scene, box, up, start, options.seed)
     angle = _ROOM_ANGLE
@@ -197,7 +216,7 @@ def of_sensors(
     sensors: Sequence[SensorCamera], size: tuple[int, int] | None, options: Options, path: Any
 ) -> Shots:
     """Every sensor of the scene, as it is; every eighth is held out."""
-    refuse(options, "the scene's own sensors", "center", "radius")
+    refuse(options, "the scene's own sensors", "center", "radius", "elevation")
     if not sensors:
         raise InputError(f"{path}: has no sensor that is a camera, expected one of {CAMERAS}")
     counts = _sensor_counts(len(sensors), options)

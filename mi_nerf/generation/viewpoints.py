@@ -49,6 +49,7 @@ def around(
     up: Array,
     center: Array,
     radius: float,
+    elevation: tuple[float, float] | None = None,
 ) -> Array:
     """OpenGL poses on a (hemi)sphere, uniform in area, that look at its centre, (count, 4, 4).
 
@@ -57,12 +58,16 @@ def around(
         cameras: ``"hemisphere"`` (above ``center``) or ``"sphere"``.
         up: Vertical unit vector.
         radius: Distance from ``center``.
+        elevation: The part of the sphere between these angles over its horizon, in degrees,
+            whatever ``cameras`` is.
     """
-    low = _LOWEST[cameras]
+    low, high = _LOWEST[cameras], _HIGHEST
+    if elevation is not None:
+        low, high = (math.sin(math.radians(angle)) for angle in elevation)
     side, front = horizontal_axes(up)
     poses = []
     for u, v in unit_square(count, seed, _SPLIT_SEEDS[split]):
-        height = low + (_HIGHEST - low) * u
+        height = low + (high - low) * u
         level = math.sqrt(1 - height * height)
         angle = 2 * math.pi * v
         out = level * (math.cos(angle) * side + math.sin(angle) * front) + height * up

@@ -1,7 +1,8 @@
-"""The place of unbounded/courtyard: an armillary sphere over a basin, a court, hills, the sky.
+"""The place of unbounded/courtyard: an armillary sphere over a basin, and a court around it.
 
 Lengths are metres. The court is 15 wide, with arcades in the north and the west, a wall in
-the east and a balustrade in the south, beyond which the ground falls.
+the east and a balustrade in the south. ``courtyard_land.py`` and ``courtyard_paint.py`` make the
+land around and the textures.
 """
 
 from __future__ import annotations
@@ -14,19 +15,13 @@ import numpy as np
 from geometry import Array, grid_faces, output_folder, write_ply
 from solids import Solid, arc, box, fragment, merge, mesh, moved, shape, spline, step, wedge
 from surfaces import (
-    blend,
     block,
-    cells,
     leaves,
-    noise,
     prism,
     put_mesh,
-    rough,
-    save,
     scale,
     slab,
     tube,
-    tuft,
     turn,
     write_solid,
     write_turned,
@@ -112,11 +107,11 @@ def sphere_of_rings() -> list[str]:
         ("antarctic", "polar", "brass", [step("translate", z=-0.386), tip]),
         ("gnomon", "arrow", "gilt", [tip]),
     ]:
-        out.append(mesh(f"courtyard_{file}.ply", name, [*steps, size, at], material))
+        out.append(mesh(f"courtyard_{file}.ply", f"fountain_{name}", [*steps, size, at], material))
     for k in range(4):
         steps = [turn(90 * k + 45), size, step("translate", z=1.36)]
-        out.append(mesh("courtyard_scroll.ply", f"scroll_{k}", steps, "bronze"))
-        out.append(put("pedestal", f"pedestal_{k}", "stone", (0, 0, 0), turn(90 * k)))
+        out.append(mesh("courtyard_scroll.ply", f"fountain_scroll_{k}", steps, "bronze"))
+        out.append(put("pedestal", f"fountain_pedestal_{k}", "stone", (0, 0, 0), turn(90 * k)))
     return out
 
 
@@ -134,17 +129,30 @@ def basin() -> list[str]:
     """An octagonal basin with glazed tiles, on a step, with water lilies."""
     out = []
     for k in range(8):
-        out.append(put("side", f"basin_{k}", "azulejo", (0, 0, 0), turn(45 * k)))
-        out.append(put("coping", f"coping_{k}", "stone", (0, 0, 0), turn(45 * k)))
-        out.append(put("tread", f"tread_{k}", "stone", (0, 0, 0), turn(45 * k)))
-    out.append(shape("disk", "surface", [scale(1.2), step("translate", z=0.5)], "water"))
+        out.append(put("side", f"fountain_basin_{k}", "azulejo", (0, 0, 0), turn(45 * k)))
+        out.append(put("coping", f"fountain_coping_{k}", "stone", (0, 0, 0), turn(45 * k)))
+        out.append(put("tread", f"fountain_tread_{k}", "stone", (0, 0, 0), turn(45 * k)))
+    out.append(shape("disk", "fountain_water", [scale(1.2), step("translate", z=0.5)], "water"))
     rng = np.random.default_rng(4)
-    for k, (angle, radius) in enumerate([(20, 0.9), (41, 0.75), (57, 0.98), (200, 0.8), (222, 0.95)]):
+    for k, (angle, radius) in enumerate(
+        [(20, 0.9), (41, 0.75), (57, 0.98), (200, 0.8), (222, 0.95)]
+    ):
         a = np.radians(angle)
         at = (radius * np.cos(a), radius * np.sin(a), 0.506)
-        out.append(put("pad", f"pad_{k}", "lily_pad", at, scale(rng.uniform(0.8, 1.2)), turn(97 * k)))
+        out.append(
+            put(
+                "pad",
+                f"fountain_pad_{k}",
+                "lily_pad",
+                at,
+                scale(rng.uniform(0.8, 1.2)),
+                turn(97 * k),
+            )
+        )
         if k in (0, 3):
-            out.append(put("lily", f"lily_{k}", "lily", (at[0], at[1], 0.53), scale(0.075)))
+            out.append(
+                put("lily", f"fountain_lily_{k}", "lily", (at[0], at[1], 0.53), scale(0.075))
+            )
     return out
 
 
@@ -278,7 +286,9 @@ def upper_storey() -> list[str]:
         x = BAY * (k - 2)
         at = (x, HALF - 0.21, 5.35)
         out.append(put("window", f"window_{k}", "stone", at))
-        out.append(block(f"pane_{k}", (x - 0.5, HALF - 0.215, 5.35), (x + 0.5, HALF - 0.2, 6.95), "glass"))
+        out.append(
+            block(f"pane_{k}", (x - 0.5, HALF - 0.215, 5.35), (x + 0.5, HALF - 0.2, 6.95), "glass")
+        )
         out.append(put("bars", f"bars_{k}", "white_paint", at))
         for side in (-1, 1):
             ajar = turn(side * (8 + 23 * ((3 * k + side) % 4)))
@@ -297,8 +307,14 @@ def window() -> tuple[Solid, Solid, Solid]:
     bars = [moved(box((0.04, 0.04, 1.6), 0.004), (x, -0.01, 0.8)) for x in (-0.48, 0.0, 0.48)]
     bars += [moved(box((1.0, 0.04, 0.035), 0.004), (0, -0.01, z)) for z in (0.02, 0.55, 1.07, 1.58)]
     slats = [moved(box((0.05, 0.045, 1.56), 0.004), (x, 0, 0.8)) for x in (0.03, 0.49)]
-    tilted = slab(np.array([[-0.03, -0.006], [0.02, 0.03], [0.025, 0.025], [-0.025, -0.011]]), 0.42, 0)
-    side_on = Solid(tilted.vertices[:, [1, 0, 2]] * [-1, 1, 1], tilted.faces, tilted.normals[:, [1, 0, 2]] * [-1, 1, 1])
+    tilted = slab(
+        np.array([[-0.03, -0.006], [0.02, 0.03], [0.025, 0.025], [-0.025, -0.011]]), 0.42, 0
+    )
+    side_on = Solid(
+        tilted.vertices[:, [1, 0, 2]] * [-1, 1, 1],
+        tilted.faces,
+        tilted.normals[:, [1, 0, 2]] * [-1, 1, 1],
+    )
     slats += [moved(side_on, (0.26, 0, 0.06 + 0.085 * k)) for k in range(18)]
     return merge([*sides, sill, lintel]), merge(bars), merge(slats)
 
@@ -311,7 +327,9 @@ def tile_row() -> Solid:
         low, high = 0.115, 0.092
         ends = []
         for radius, y, lift in ((low, 0.42 * k, 0.022), (high, 0.42 * k + 0.5, 0.0)):
-            ends.append(np.stack([radius * np.cos(angle), 0 * angle + y, radius * np.sin(angle) + lift], 1))
+            ends.append(
+                np.stack([radius * np.cos(angle), 0 * angle + y, radius * np.sin(angle) + lift], 1)
+            )
         out = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], 1)
         i = np.arange(8)
         faces = np.vstack([np.stack([i, i + 10, i + 9], 1), np.stack([i, i + 1, i + 10], 1)])
@@ -346,16 +364,24 @@ def roofs(rng: np.random.Generator) -> list[str]:
 def east_wall(rng: np.random.Generator) -> list[str]:
     """A wall with a portal, a blind window and creepers, under a row of tiles."""
     out = [block("east_wall", (HALF, -HALF - 0.4, -0.5), (HALF + 0.5, HALF, 3.6), "plaster")]
-    out.append(block("east_cap", (HALF - 0.06, -HALF - 0.46, 3.6), (HALF + 0.56, HALF, 3.7), "stone"))
+    out.append(
+        block("east_cap", (HALF - 0.06, -HALF - 0.46, 3.6), (HALF + 0.56, HALF, 3.7), "stone")
+    )
     face = turn(-90)
     out.append(put("doorway", "portal", "stone", (HALF - 0.02, 2.2, 0), scale(1.15), face))
     out.append(put("door", "portal_door", "door", (HALF - 0.01, 2.2, 0), scale(1.15), face))
     for k, y in enumerate((-1.6, -4.9)):
         out.append(put("window", f"east_window_{k}", "stone", (HALF, y, 1.3), scale(0.8), face))
-        out.append(block(f"east_pane_{k}", (HALF - 0.01, y - 0.4, 1.3), (HALF + 0.05, y + 0.4, 2.55), "glass"))
+        out.append(
+            block(
+                f"east_pane_{k}", (HALF - 0.01, y - 0.4, 1.3), (HALF + 0.05, y + 0.4, 2.55), "glass"
+            )
+        )
         for b in range(5):
             low = (HALF - 0.05, y - 0.33 + 0.165 * b - 0.008, 1.3)
-            out.append(block(f"grille_{k}_{b}", low, (low[0] + 0.016, low[1] + 0.016, 2.55), "iron"))
+            out.append(
+                block(f"grille_{k}_{b}", low, (low[0] + 0.016, low[1] + 0.016, 2.55), "iron")
+            )
     spots = []
     for start, reach in ((4.4, 2.6), (-3.2, 1.9)):
         for _ in range(62):
@@ -363,7 +389,11 @@ def east_wall(rng: np.random.Generator) -> list[str]:
             y = start + rng.normal(0, 0.22 + 0.55 * height**1.5) * reach / 2
             spots.append((HALF - 0.02 - rng.uniform(0, 0.16), y, 0.15 + 3.55 * height))
     for k, spot in enumerate(spots):
-        tint = ("ivy", "ivy", "ivy_dark", "bloom")[k % 4] if spot[1] > 1 else ("ivy", "ivy_dark")[k % 2]
+        tint = (
+            ("ivy", "ivy", "ivy_dark", "bloom")[k % 4]
+            if spot[1] > 1
+            else ("ivy", "ivy_dark")[k % 2]
+        )
         flat = step("scale", x=0.17, y=rng.uniform(0.24, 0.36), z=rng.uniform(0.24, 0.36))
         out.append(put("tuft", f"creeper_{k}", tint, spot, turn(rng.uniform(0, 360)), flat))
     return out
@@ -379,7 +409,9 @@ def balustrade() -> list[str]:
         out.append(put("pier", f"pier_{k}", "stone", (x, y, 0)))
         for b in range(9):
             if k < 5:
-                out.append(put("baluster", f"baluster_{k}_{b}", "stone", (x + 0.46 + 0.26 * b, y, 0.14)))
+                out.append(
+                    put("baluster", f"baluster_{k}_{b}", "stone", (x + 0.46 + 0.26 * b, y, 0.14))
+                )
         if k in (1, 4):
             out.append(put("pot", f"urn_{k}", "terracotta", (x, y, 1.1), scale(0.62)))
             for t in range(7):
@@ -392,12 +424,24 @@ def balustrade() -> list[str]:
 
 def small_baluster() -> Array:
     """Profile of a baluster of height 0.78."""
-    line = spline([(0.05, 0.1), (0.045, 0.14), (0.095, 0.27), (0.07, 0.45), (0.045, 0.6), (0.06, 0.66)], 3)
-    return np.vstack([[(0.09, 0.0), (0.09, 0.08), (0.05, 0.1)], line, [(0.085, 0.69), (0.085, 0.78)]])
+    line = spline(
+        [(0.05, 0.1), (0.045, 0.14), (0.095, 0.27), (0.07, 0.45), (0.045, 0.6), (0.06, 0.66)], 3
+    )
+    return np.vstack(
+        [[(0.09, 0.0), (0.09, 0.08), (0.05, 0.1)], line, [(0.085, 0.69), (0.085, 0.78)]]
+    )
 
 
-def crown(name: str, at: Sequence[float], radius: float, count: int, rng: np.random.Generator,
-          tints: Sequence[str], size: float, flat: float = 0.85) -> list[str]:
+def crown(
+    name: str,
+    at: Sequence[float],
+    radius: float,
+    count: int,
+    rng: np.random.Generator,
+    tints: Sequence[str],
+    size: float,
+    flat: float = 0.85,
+) -> list[str]:
     """A crown of tufts around a place."""
     out = []
     for k in range(count):
@@ -417,15 +461,31 @@ def potted_trees(rng: np.random.Generator) -> list[str]:
     for i, (x, y) in enumerate(lemons):
         out.append(put("pot", f"pot_{i}", "terracotta", (x, y, 0), turn(40 * i)))
         out.append(put("trunk", f"trunk_{i}", "bark", (x, y, 0.55), turn(70 * i)))
-        out += crown(f"crown_{i}", (x, y, 1.95), 0.52, 26, rng, ("citrus", "citrus", "citrus_light"), 0.24)
+        out += crown(
+            f"crown_{i}", (x, y, 1.95), 0.52, 26, rng, ("citrus", "citrus", "citrus_light"), 0.24
+        )
         for k in range(9):
             a, z = rng.uniform(0, 2 * np.pi), rng.uniform(-0.4, 0.3)
             spot = (x + 0.56 * np.cos(a), y + 0.56 * np.sin(a), 1.95 + z)
-            fruit = [step("scale", x=0.036, y=0.036, z=0.048), step("translate", x=spot[0], y=spot[1], z=spot[2])]
+            fruit = [
+                step("scale", x=0.036, y=0.036, z=0.048),
+                step("translate", x=spot[0], y=spot[1], z=spot[2]),
+            ]
             out.append(mesh("courtyard_ball.ply", f"lemon_{i}_{k}", fruit, "lemon"))
-    for i, (x, y, size) in enumerate([(-2.4, 6.5, 0.75), (2.3, 6.6, 0.8), (-6.6, 1.4, 0.7), (6.6, 0.3, 0.85), (6.7, -3.1, 0.6)]):
+    for i, (x, y, size) in enumerate(
+        [(-2.4, 6.5, 0.75), (2.3, 6.6, 0.8), (-6.6, 1.4, 0.7), (6.6, 0.3, 0.85), (6.7, -3.1, 0.6)]
+    ):
         out.append(put("pot", f"box_pot_{i}", "terracotta", (x, y, 0), scale(size), turn(30 * i)))
-        out += crown(f"box_{i}", (x, y, 0.92 * size), 0.3 * size, 14, rng, ("ivy", "ivy_dark"), 0.2 * size, 1.0)
+        out += crown(
+            f"box_{i}",
+            (x, y, 0.92 * size),
+            0.3 * size,
+            14,
+            rng,
+            ("ivy", "ivy_dark"),
+            0.2 * size,
+            1.0,
+        )
     return out
 
 
@@ -445,7 +505,11 @@ def smaller_things() -> list[str]:
     out = [put("can", "watering_can", "zinc", (1.33, 0.55, 0.16), turn(-35))]
     x, y = 3.9, 5.75
     out.append(put("table", "table", "iron", (x, y, 0)))
-    out.append(shape("disk", "table_top", [scale(0.42), step("translate", x=x, y=y, z=0.752)], "azulejo_top"))
+    out.append(
+        shape(
+            "disk", "table_top", [scale(0.42), step("translate", x=x, y=y, z=0.752)], "azulejo_top"
+        )
+    )
     for k, (dx, dy, angle) in enumerate([(-0.75, 0.1, 80), (0.5, -0.6, -140)]):
         out.append(put("chair", f"chair_{k}", "chair_paint", (x + dx, y + dy, 0), turn(angle)))
     out.append(put("bottle", "wine_bottle", "bottle", (x + 0.12, y + 0.1, 0.755)))
@@ -463,14 +527,35 @@ def watering_can() -> Solid:
     profile = [(0.0, 0.0), (0.13, 0.0), (0.135, 0.02), (0.12, 0.25), (0.125, 0.27), (0.11, 0.27)]
     body, _ = wedge(np.array([*profile, (0.1, 0.24), (0.0, 0.235)]), 1, 24)
     spout = tube(spline([(0.11, 0, 0.06), (0.24, 0, 0.16), (0.36, 0, 0.33)], 5), 0.016, 8)
-    rose = tube(np.array([[0.35, 0, 0.315], [0.4, 0, 0.385], [0.401, 0, 0.386]]), np.array([0.018, 0.05, 0.0]), 12)
-    handle = tube(spline([(-0.11, 0, 0.06), (-0.24, 0, 0.14), (-0.22, 0, 0.3), (-0.05, 0, 0.38), (0.09, 0, 0.27)], 5), 0.011, 8)
+    rose = tube(
+        np.array([[0.35, 0, 0.315], [0.4, 0, 0.385], [0.401, 0, 0.386]]),
+        np.array([0.018, 0.05, 0.0]),
+        12,
+    )
+    handle = tube(
+        spline(
+            [
+                (-0.11, 0, 0.06),
+                (-0.24, 0, 0.14),
+                (-0.22, 0, 0.3),
+                (-0.05, 0, 0.38),
+                (0.09, 0, 0.27),
+            ],
+            5,
+        ),
+        0.011,
+        8,
+    )
     return merge([body, spout, rose, handle])
 
 
 def garden_chair() -> Solid:
     """A chair of slats, facing -y."""
-    legs = [moved(box((0.035, 0.035, 0.45), 0.004), (x, y, 0.225)) for x in (-0.2, 0.2) for y in (-0.19, 0.19)]
+    legs = [
+        moved(box((0.035, 0.035, 0.45), 0.004), (x, y, 0.225))
+        for x in (-0.2, 0.2)
+        for y in (-0.19, 0.19)
+    ]
     seat = [moved(box((0.43, 0.07, 0.018), 0.004), (0, -0.17 + 0.085 * k, 0.455)) for k in range(5)]
     posts = [moved(box((0.035, 0.03, 0.48), 0.004), (x, 0.2, 0.68)) for x in (-0.2, 0.2)]
     back = [moved(box((0.42, 0.016, 0.055), 0.004), (0, 0.2, 0.62 + 0.1 * k)) for k in range(4)]
@@ -488,318 +573,6 @@ def iron_table() -> Solid:
     return merge(rods)
 
 
-# ---- Near and far surroundings -----------------------------------------------
-
-
-def waves(x: Array, y: Array, seed: int) -> Array:
-    """Smooth noise, mostly from -1 to 1, over a plane that does not repeat."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros(np.broadcast(x, y).shape)
-    for _ in range(7):
-        angle, phase = rng.uniform(0, 2 * np.pi, 2)
-        total += np.sin(np.cos(angle) * x + np.sin(angle) * y + phase)
-    return total / 4
-
-
-HILLS = [  # azimuth from the north, distance, height, width
-    (158, 175, 40, 48), (205, 260, 52, 75), (120, 310, 60, 90), (240, 420, 85, 110),
-    (175, 480, 78, 110), (90, 420, 85, 120), (40, 350, 70, 110), (320, 380, 80, 120), (275, 330, 66, 100),
-]  # fmt: skip
-
-
-def ground_height(x: Array, y: Array) -> Array:
-    """Height of the land: the court's hill, a valley around it, and hills."""
-    away = np.hypot(x, y)
-    height = -0.7 - 27 * (1 - np.exp(-((np.maximum(away - 10, 0) / 42) ** 1.5)))
-    for azimuth, distance, top, width in HILLS:
-        a = np.radians(azimuth)
-        gap = np.hypot(x - distance * np.sin(a), y - distance * np.cos(a))
-        height = height + top * np.exp(-((gap / width) ** 2))
-    fade = np.clip((away - 14) / 60, 0, 1)
-    return height + fade * (3.2 * waves(x / 28, y / 28, 2) + 0.9 * waves(x / 9, y / 9, 5))
-
-
-def land() -> tuple[Array, Array, Array]:
-    """The ground from the court to the hills, as a fan of rings; uv covers 1200 metres."""
-    columns, rows = 112, 30
-    angle = 2 * np.pi * np.arange(columns) / columns
-    away = 10.8 * (560 / 10.8) ** (np.linspace(0, 1, rows)[:, None] ** 0.9)
-    x, y = away * np.sin(angle), away * np.cos(angle)
-    points = np.stack([x, y, ground_height(x, y)], -1).reshape(-1, 3)
-    i = np.arange(rows - 1)[:, None] * columns + np.arange(columns)
-    j = np.arange(rows - 1)[:, None] * columns + (np.arange(columns) + 1) % columns
-    i, j = i.ravel(), j.ravel()
-    faces = np.vstack([np.stack([i, j + columns, j], 1), np.stack([i, i + columns, j + columns], 1)])
-    return points, faces, points[:, :2] / 1200 + 0.5
-
-
-def mountains(number: int) -> tuple[Array, Array, Array, Array]:
-    """A range all around, 0 the nearer: points, faces, normals and uv, v from foot to crest.
-
-    Normals point up more than the surface does: haze shines from within.
-    """
-    distance, top, seed = ((760.0, 50.0, 11), (1150.0, 165.0, 17))[number]
-    columns = 200
-    angle = np.linspace(0, 2 * np.pi, columns + 1)
-    x, y = np.sin(angle), np.cos(angle)
-    crest = 1 + 0.6 * waves(2.3 * x, 2.3 * y, seed) + 0.32 * waves(7 * x, 7 * y, seed + 1)
-    crest = top * (crest + 0.12 * waves(21 * x, 21 * y, seed + 2) + 0.05 * waves(53 * x, 53 * y, seed + 3))
-    v = np.array([0.0, 0.35, 0.7, 1.0])[:, None]
-    away = distance * (1 + 0.1 * v + 0.02 * waves(25 * x, 25 * y + 3 * v, seed + 4) * (1 - v))
-    z = -60 + (crest + 60) * v
-    points = np.stack(np.broadcast_arrays(away * x, away * y, z), -1).reshape(-1, 3)
-    turned = 0.35 * waves(31 * x, 31 * y + 2 * v, seed + 5)
-    normals = np.stack(np.broadcast_arrays(-x - turned * y, -y + turned * x, 2.6 + 0 * v), -1)
-    uv = np.stack(np.broadcast_arrays(6 * angle / np.pi, v), -1).reshape(-1, 2)
-    return points, grid_faces(4, columns + 1), normals.reshape(-1, 3), uv
-
-
-def cypress(rng: np.random.Generator) -> tuple[Array, ...]:
-    """A cypress of height 1: leaves over a spindle."""
-    count = 420
-    t = rng.uniform(0.03, 1.0, count) ** 1.15
-    radius = 0.105 * np.sin(np.pi * t**0.62) ** 0.8 * rng.uniform(0.75, 1.08, count)
-    angle = rng.uniform(0, 2 * np.pi, count)
-    spots = np.stack([radius * np.cos(angle), radius * np.sin(angle), t], 1)
-    axes = np.stack([0.35 * np.cos(angle), 0.35 * np.sin(angle), np.ones(count)], 1)
-    return leaves(spots, axes + rng.normal(0, 0.12, (count, 3)), np.full(count, 0.1), rng)
-
-
-def at_ground(azimuth: float, distance: float) -> Array:
-    """A place on the land."""
-    a = np.radians(azimuth)
-    x, y = np.array(distance * np.sin(a)), np.array(distance * np.cos(a))
-    return np.array([x, y, ground_height(x, y)])
-
-
-def landscape(rng: np.random.Generator) -> list[str]:
-    """A village on the hill in the south, farms, rows of cypresses, and trees near by."""
-    out = []
-    near = [(9.6, 3.4, 6.5), (9.4, -0.6, 7.6), (9.9, -3.2, 6.8), (9.5, -6.4, 7.4), (12.6, 1.6, 8.5)]
-    for k, (x, y, size) in enumerate(near):
-        out.append(put("cypress", f"cypress_{k}", "cypress", (x, y, -0.8), scale(size), turn(60 * k)))
-    for k in range(58):
-        azimuth = 196 + 20 * np.sin(k / 9) + rng.normal(0, 0.4)
-        at = at_ground(azimuth, 48 + 3.6 * k)
-        out.append(put("cypress", f"avenue_{k}", "cypress", at, scale(rng.uniform(4.5, 7.5))))
-    for k in range(34):
-        at = at_ground(rng.normal(158, 7.5), rng.normal(170, 16))
-        size = rng.uniform(5.5, 9.0)
-        moves = [step("scale", x=size, y=size, z=size * rng.uniform(0.8, 1.4)), turn(rng.uniform(0, 180))]
-        at[2] += 0.3 * size
-        out.append(put("house", f"house_{k}", ("plaster_far", "plaster_far_2")[k % 2], at, *moves))
-        out.append(put("roof", f"roof_{k}", ("tile", "tile_light")[k % 2], at, *moves))
-    top = at_ground(158, 176)
-    out.append(put("tower", "campanile", "stone", top, scale(1.0), turn(20)))
-    out.append(put("spire", "campanile_roof", "tile", top, scale(1.0), turn(20)))
-    for k in range(26):
-        at = at_ground(rng.uniform(95, 265), rng.uniform(60, 330))
-        if k % 3 == 0:
-            size = rng.uniform(6, 9)
-            at[2] += 0.25 * size
-            moves = [scale(size), turn(rng.uniform(0, 180))]
-            out.append(put("house", f"farm_{k}", "plaster_far", at, *moves))
-            out.append(put("roof", f"farm_roof_{k}", "tile", at, *moves))
-    for k in range(120):
-        near_by = k < 30
-        distance = rng.uniform(16, 40) if near_by else rng.uniform(45, 330)
-        at = at_ground(rng.uniform(100, 260), distance)
-        size = rng.uniform(1.3, 2.6) * (1 if near_by else 1.5)
-        at[2] += 0.55 * size
-        tint = ("olive", "olive_dark", "grove")[rng.integers(3)]
-        out.append(put("tuft", f"grove_{k}", tint, at, scale(size), turn(rng.uniform(0, 360))))
-    tall = (-14.5, 15.5, 0)
-    out.append(put("tower", "tower", "plaster", tall, scale(0.86)))
-    out.append(put("spire", "tower_roof", "tile", tall, scale(0.86)))
-    return out
-
-
-def house() -> tuple[Solid, Solid]:
-    """The walls and the roof of a house of length 1."""
-    walls = [[-0.36, -0.5], [0.36, -0.5], [0.36, 0.3], [0.0, 0.5], [-0.36, 0.3]]
-    roof = [[-0.44, 0.255], [0.0, 0.49], [0.44, 0.255], [0.44, 0.3], [0.0, 0.545], [-0.44, 0.3]]
-    return slab(np.array(walls), 1.0, 0.0), slab(np.array(roof), 1.12, 0.0)
-
-
-def tower() -> tuple[Solid, Solid]:
-    """A bell tower of height 22 with four openings at its top, and its roof."""
-    parts = [moved(box((4.4, 4.4, 15.5), 0.05), (0, 0, 7.25))]
-    parts += [moved(box((4.9, 4.9, 0.4), 0.06), (0, 0, z)) for z in (8.2, 15.2, 20.4)]
-    parts += [moved(box((1.1, 1.1, 5.0), 0.04), (x, y, 17.8)) for x in (-1.6, 1.6) for y in (-1.6, 1.6)]
-    hole = arc(1.05, 180, 0, 13) + [0, 18.4]
-    side = np.vstack([[[-1.6, 18.4]], hole, [[1.6, 18.4], [1.6, 20.3], [-1.6, 20.3]]])
-    face = slab(side, 0.5, 0.0)
-    parts += [moved(moved(face, (0, -1.9, 0)), (0, 0, 0), 90 * k) for k in range(4)]
-    pyramid, _ = wedge(np.array([(3.4, 20.6), (3.5, 20.75), (0.0, 23.6)]), 1, 4)
-    return merge(parts), moved(pyramid, (0, 0, 0), 45)
-
-
-# ---- Textures ----------------------------------------------------------------
-
-
-def paving(size: int = 512) -> Array:
-    """Cobbles in frames of slabs; the picture repeats every 2.4 metres."""
-    rng = np.random.default_rng(1)
-    count = 25
-    column, row = np.meshgrid(np.arange(count), np.arange(count))
-    points = np.stack([(column + 0.5 * (row % 2)) / count, (row + 0.5) / count], -1).reshape(-1, 2)
-    points = (points + rng.normal(0, 0.0065, points.shape)) % 1
-    number, edge = cells(size, points)
-    tones = np.array([(0.56, 0.50, 0.44), (0.47, 0.43, 0.40), (0.63, 0.57, 0.49), (0.55, 0.45, 0.40)])
-    stone = tones[rng.integers(0, 4, len(points))] + rng.normal(0, 0.03, (len(points), 1))
-    stone = stone[number] + 0.025 * rough(size, 30, 3, rng)[..., None]
-    picture = blend((0.30, 0.27, 0.22), stone, (edge - 0.004) / 0.006)
-    y, x = (np.mgrid[:size, :size] + 0.5) / size * 2.4
-    slab = (0.66, 0.61, 0.53) + 0.02 * rough(size, 6, 5, rng)[..., None]
-    for along, across in ((x, y), (y, x)):
-        part = np.floor(along / 0.8).astype(int)
-        shade = np.array([0.0, 0.035, -0.03])[part % 3][..., None]
-        joint = np.minimum((along % 0.8), 0.8 - along % 0.8)
-        joint = np.minimum(joint, np.minimum(across, np.abs(across - 0.36)))
-        inside = across < 0.36
-        framed = blend((0.33, 0.29, 0.24), slab + shade, (joint - 0.004) / 0.006)
-        picture = np.where(inside[..., None], framed, picture)
-    return picture
-
-
-def plaster(base: Sequence[float], seed: int, size: int = 320) -> Array:
-    """Old plaster with stains, patches and hair cracks; repeats every 3 metres."""
-    rng = np.random.default_rng(seed)
-    picture = np.asarray(base) * (1 + 0.045 * rough(size, 3, 6, rng)[..., None])
-    pale = np.clip(rough(size, 4, 4, rng) - 0.9, 0, 1)
-    picture = blend(picture, np.minimum(np.asarray(base) * 1.22, 0.93), 0.8 * pale)
-    streaks = np.clip(noise(size, (2.0, 26), rng) * 0.5 + 0.5 * noise(size, (1.5, 9), rng) - 0.55, 0, 1)
-    picture = blend(picture, np.asarray(base) * 0.72, 0.55 * streaks)
-    line = np.abs(noise(size, (6, 6), rng) + 0.35 * noise(size, (24, 24), rng))
-    crack = (line < 0.035) & (noise(size, (4, 4), rng) > 1.1)
-    return np.where(crack[..., None], picture * 0.74, picture)
-
-
-def stone(size: int = 256) -> Array:
-    """Travertine: bands, clouds and pits; repeats every metre."""
-    rng = np.random.default_rng(8)
-    bands = noise(size, (14, 1.2), rng) + 0.7 * noise(size, (38, 3), rng)
-    picture = blend((0.73, 0.68, 0.58), (0.84, 0.80, 0.72), 0.5 + 0.3 * bands)
-    picture = picture * (1 + 0.03 * rough(size, 4, 5, rng)[..., None])
-    pits = np.clip(noise(size, (42, 16), rng) + 0.5 * bands - 1.9, 0, 1)
-    return blend(picture, (0.42, 0.37, 0.29), 1.2 * pits)
-
-
-def azulejo(size: int = 288) -> Array:
-    """Four painted tiles with a star, leaves and a frame, and the glaze's small faults."""
-    rng = np.random.default_rng(9)
-    y, x = (np.mgrid[:size, :size] + 0.5) / size * 2
-    u, v = np.abs(x % 1 - 0.5), np.abs(y % 1 - 0.5)
-    r, a = np.hypot(u, v), np.arctan2(v, u)
-    white, blue, pale, yellow = (0.88, 0.88, 0.84), (0.09, 0.20, 0.50), (0.45, 0.62, 0.80), (0.89, 0.66, 0.18)
-    picture = np.broadcast_to(white, (size, size, 3)).copy()
-
-    def paint(where: Array, colour: Sequence[float]) -> None:
-        picture[where] = colour
-
-    paint(r < 0.30 + 0.075 * np.cos(8 * a), blue)
-    paint(r < 0.25 + 0.07 * np.cos(8 * a), pale)
-    paint(r < 0.13 + 0.03 * np.cos(8 * a + np.pi), yellow)
-    paint(r < 0.05, blue)
-    corner = np.hypot(0.5 - u, 0.5 - v)
-    paint((corner < 0.24) & (corner > 0.2), blue)
-    paint(corner < 0.15, yellow)
-    paint(corner < 0.085, blue)
-    stem = np.abs(u - v) < 0.018
-    paint(stem & (r > 0.3) & (corner > 0.24), blue)
-    leaf = np.hypot((u - v) * 3.2, u + v - 0.62) < 0.09
-    paint(leaf, blue)
-    edge = np.maximum(u, v)
-    paint((edge > 0.46) & (edge < 0.472), blue)
-    tint = np.array([0.0, 0.02, -0.025, 0.01])[(2 * (y.astype(int) % 2) + x.astype(int) % 2)]
-    picture = picture + tint[..., None] + 0.012 * rough(size, 20, 3, rng)[..., None]
-    return np.where((edge > 0.49)[..., None], (0.45, 0.42, 0.38), picture)
-
-
-def planks(size: int = 192) -> Array:
-    """Weathered boards, grain along v; repeats every metre."""
-    rng = np.random.default_rng(10)
-    grain = noise(size, (2, 34), rng) + 0.6 * noise(size, (5, 70), rng) + 0.4 * rough(size, 4, 4, rng)
-    return blend((0.28, 0.19, 0.12), (0.52, 0.38, 0.25), 0.5 + 0.2 * grain)
-
-
-def hours(width: int = 768, height: int = 32) -> Array:
-    """The scale on the equator: hours, quarters and a line."""
-    picture = np.broadcast_to((0.73, 0.58, 0.30), (height, width, 3)).copy()
-    x = (np.arange(width) + 0.5) / width * 24
-    y = (np.arange(height) + 0.5)[:, None] / height
-    quarter, hour = np.abs((4 * x) % 1 - 0.5) > 0.42, np.abs(x % 1 - 0.5) > 0.455
-    ink = (quarter & (y < 0.3)) | (hour & (y < 0.55)) | (np.abs(y - 0.58) < 0.03) + 0 * x.astype(bool)
-    numeral = np.zeros((height, width), bool)
-    for k in range(24):  # as many strokes as the hour has fives and ones, after a fashion
-        strokes = "".join(["X" * (k % 12 // 10), "V" * (k % 12 % 10 // 5), "I" * (k % 5)]) or "O"
-        for s, letter in enumerate(strokes):
-            at = k + 0.5 + 0.11 * (s - (len(strokes) - 1) / 2)
-            lean = {"X": np.abs(np.abs(x - at) - np.abs(y - 0.78) * 0.3), "I": np.abs(x - at) + 0 * y}
-            lean["V"] = np.abs(np.abs(x - at) - (0.92 - y) * 0.16)
-            lean["O"] = np.abs(np.hypot((x - at) * 2, (y - 0.78) * 0.9) - 0.1)
-            numeral |= (lean[letter] < 0.018) & (np.abs(y - 0.78) < 0.14)
-    return np.where((ink | numeral)[..., None], (0.13, 0.09, 0.05), picture)
-
-
-def fields(size: int = 640) -> Array:
-    """The colours of the land from above, 1200 metres wide: fields, vines, woods, lanes."""
-    rng = np.random.default_rng(11)
-    number, edge = cells(size, rng.uniform(size=(520, 2)), 0.7)
-    crops = np.array(
-        [(0.55, 0.56, 0.28), (0.70, 0.62, 0.36), (0.42, 0.50, 0.22), (0.62, 0.52, 0.34), (0.50, 0.56, 0.30)]
-    )
-    kind = rng.integers(0, 5, 520)[number]
-    picture = crops[kind] + rng.normal(0, 0.02, (520, 1))[number]
-    y, x = np.mgrid[:size, :size] + 0.5
-    angle = rng.uniform(0, np.pi, 520)[number]
-    rows = np.sin(2 * np.pi * (x * np.cos(angle) + y * np.sin(angle)) / 3.1)
-    picture = np.where(((kind == 2) | (kind == 0))[..., None], picture * (1 + 0.16 * rows[..., None]), picture)
-    wood = np.clip(2.5 * (rough(size, 7, 5, rng) - 0.75), 0, 1)
-    picture = blend(picture, (0.20, 0.27, 0.13) + 0.03 * noise(size, (150, 150), rng)[..., None], wood)
-    picture = blend((0.22, 0.29, 0.14), picture, (edge - 0.0008) / 0.0012)
-    haze = np.clip(np.hypot(x - size / 2, y - size / 2) / size * 1200 / 560, 0, 1)
-    return blend(picture * (1 + 0.04 * rough(size, 40, 3, rng)[..., None]), (0.60, 0.68, 0.72), 0.62 * haze)
-
-
-def slopes(number: int, size: int = 192) -> Array:
-    """A range of mountains, 0 the nearer: woods and gullies, in the haze at its foot."""
-    rng = np.random.default_rng(12 + number)
-    low, high, haze = [
-        ((0.36, 0.48, 0.40), (0.56, 0.64, 0.56), (0.68, 0.75, 0.76)),
-        ((0.50, 0.60, 0.68), (0.68, 0.75, 0.82), (0.76, 0.83, 0.88)),
-    ][number]
-    v = 1 - (np.arange(size)[:, None] + 0.5) / size
-    gully = noise(size, (3, 20), rng) + 0.7 * noise(size, (12, 50), rng)
-    picture = blend(low, high, v - 0.1 + 0.3 * gully)
-    return blend(picture, haze, 0.85 - 1.1 * v + 0 * gully)
-
-
-def sky(width: int = 1024) -> Array:
-    """A summer sky with cumulus, all directions; brightest around the sun in the south-west."""
-    height = width // 2
-    rng = np.random.default_rng(13)
-    v, u = np.mgrid[:height, :width] + 0.5
-    elevation, azimuth = np.pi * (0.5 - v / height), 2 * np.pi * u / width
-    way = np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
-    a, e = np.radians(215), np.radians(50)
-    sun = np.clip(way @ [np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)], -1, 1)
-    rise = np.clip(way[..., 2], 0, 1)
-    picture = blend((0.80, 0.87, 0.93), (0.30, 0.51, 0.80), (1.15 * rise) ** 0.55)
-    picture = blend(picture, (0.97, 0.96, 0.92), 0.75 * np.exp(-(1 - sun) / 0.05))
-    # Clouds lie in a plane far up: they crowd towards the horizon.
-    x, y = (way[..., k] / (rise + 0.16) for k in (0, 1))
-    size = 1024
-    field = rough(size, 9, 7, rng)
-    puffs = field[(x * 90).astype(int) % size, (y * 90).astype(int) % size]
-    light = field[((x - 0.06) * 90).astype(int) % size, ((y - 0.05) * 90).astype(int) % size]
-    amount = np.clip((puffs - 0.35) * 1.5, 0, 1) * np.clip(rise * 9, 0, 1)
-    shade = np.clip(0.5 + 0.6 * (puffs - light), 0, 1)
-    cloud = blend((0.98, 0.97, 0.95), (0.74, 0.78, 0.84), np.clip(amount * 0.9 - 0.4 + 0.3 * shade, 0, 1))
-    picture = blend(picture, cloud, amount)
-    return blend(picture, (0.42, 0.40, 0.30), -way[..., 2] * 8)
-
-
 # ---- Files -------------------------------------------------------------------
 
 
@@ -813,9 +586,13 @@ def write_object(folder: Path) -> None:
         ("zodiac", ring(0.427, 0.05, 0.008), 56),
     ]:
         write_turned(folder / f"courtyard_{name}.ply", profile, 1, steps)
-    flat = np.array([(0.465, -0.011), (0.53, -0.011), (0.53, 0.011), (0.465, 0.011), (0.465, -0.011)])
+    flat = np.array(
+        [(0.465, -0.011), (0.53, -0.011), (0.53, 0.011), (0.465, 0.011), (0.465, -0.011)]
+    )
     write_turned(folder / "courtyard_horizon.ply", flat, 1, 56)
-    band = np.array([(0.436, 0.037), (0.436, -0.037), (0.44, -0.037), (0.44, 0.037), (0.436, 0.037)])
+    band = np.array(
+        [(0.436, 0.037), (0.436, -0.037), (0.44, -0.037), (0.44, 0.037), (0.436, 0.037)]
+    )
     write_band(folder / "courtyard_band.ply", band)
     fluted(folder / "courtyard_pedestal.ply")
     write_solid(folder / "courtyard_arrow.ply", arrow())
@@ -824,7 +601,12 @@ def write_object(folder: Path) -> None:
 
     def sector(near: float, far: float, gap: float = 0.0) -> Array:
         return np.array(
-            [(near, -near * tangent + gap), (far, -far * tangent + gap), (far, far * tangent - gap), (near, near * tangent - gap)]
+            [
+                (near, -near * tangent + gap),
+                (far, -far * tangent + gap),
+                (far, far * tangent - gap),
+                (near, near * tangent - gap),
+            ]
         )
 
     side = prism(sector(1.16, 1.36), 0.0, 0.56, 0.0)
@@ -847,9 +629,13 @@ def write_court(folder: Path) -> None:
     frame, bars, shutter = window()
     posts, leaf = doorway()
     wide = 5 * BAY
-    cornice = np.array([(-0.21, 0), (-0.3, 0.06), (-0.3, 0.11), (-0.36, 0.17), (-0.36, 0.2), (0.1, 0.2), (0.1, 0)])
+    cornice = np.array(
+        [(-0.21, 0), (-0.3, 0.06), (-0.3, 0.11), (-0.36, 0.17), (-0.36, 0.2), (0.1, 0.2), (0.1, 0)]
+    )
     length = slab(cornice[::-1], wide, 0.004)
-    along = Solid(length.vertices[:, [1, 0, 2]], length.faces[:, ::-1], length.normals[:, [1, 0, 2]])
+    along = Solid(
+        length.vertices[:, [1, 0, 2]], length.faces[:, ::-1], length.normals[:, [1, 0, 2]]
+    )
     solids = {
         "bay": bay_wall(),
         "voussoirs": voussoirs(),
@@ -867,7 +653,12 @@ def write_court(folder: Path) -> None:
         "rafter": moved(box((0.12, 1.5, 0.14), 0.008), (0, 0, 0)),
         "tiles": tile_row(),
         "rail": box((wide, 0.36, 0.12), 0.02),
-        "pier": merge([moved(box((0.44, 0.44, 1.0), 0.012), (0, 0, 0.5)), moved(box((0.54, 0.54, 0.1), 0.015), (0, 0, 1.05))]),
+        "pier": merge(
+            [
+                moved(box((0.44, 0.44, 1.0), 0.012), (0, 0, 0.5)),
+                moved(box((0.54, 0.54, 0.1), 0.015), (0, 0, 1.05)),
+            ]
+        ),
         "trunk": trunk(),
         "can": watering_can(),
         "chair": garden_chair(),
@@ -875,8 +666,26 @@ def write_court(folder: Path) -> None:
     }
     for name, solid in solids.items():
         write_solid(folder / f"courtyard_{name}.ply", solid)
-    cup = [(0.0, 0.0), (0.03, 0.0), (0.036, 0.03), (0.037, 0.075), (0.034, 0.075), (0.032, 0.02), (0, 0.01)]
-    bottle = [(0.0, 0.0), (0.036, 0.0), (0.038, 0.01), (0.038, 0.17), (0.03, 0.2), (0.014, 0.23), (0.013, 0.29), (0.016, 0.3), (0, 0.3)]
+    cup = [
+        (0.0, 0.0),
+        (0.03, 0.0),
+        (0.036, 0.03),
+        (0.037, 0.075),
+        (0.034, 0.075),
+        (0.032, 0.02),
+        (0, 0.01),
+    ]
+    bottle = [
+        (0.0, 0.0),
+        (0.036, 0.0),
+        (0.038, 0.01),
+        (0.038, 0.17),
+        (0.03, 0.2),
+        (0.014, 0.23),
+        (0.013, 0.29),
+        (0.016, 0.3),
+        (0, 0.3),
+    ]
     for name, profile, steps in [
         ("ball", arc(1.0, -90, 90, 9), 12),
         ("column", column(), 24),
@@ -889,40 +698,15 @@ def write_court(folder: Path) -> None:
         write_turned(folder / f"courtyard_{name}.ply", profile, 1, steps)
 
 
-def write_surroundings(folder: Path) -> None:
-    """Plants, the land and what stands on it."""
-    rng = np.random.default_rng(5)
-    write_ply(folder / "courtyard_tuft.ply", *tuft(90, 0.36, rng))
-    write_ply(folder / "courtyard_cypress.ply", *cypress(rng))
-    points, faces, uv = land()
-    write_ply(folder / "courtyard_land.ply", points, faces, uv=uv)
-    for number in range(2):
-        points, faces, normals, uv = mountains(number)
-        path = folder / f"courtyard_mountains_{number}.ply"
-        write_ply(path, points, faces, normals=normals, uv=uv)
-    for name, solid in zip(("house", "roof", "tower", "spire"), (*house(), *tower()), strict=True):
-        write_solid(folder / f"courtyard_{name}.ply", solid)
-
-
 def main() -> None:
-    """Writes every file of the scene."""
+    """Writes the meshes, and where they stand."""
     folder = output_folder()
     write_object(folder)
     write_court(folder)
-    write_surroundings(folder)
     rng = np.random.default_rng(14)
-    pictures = {"paving": paving(), "stone": stone(), "azulejo": azulejo(), "planks": planks()}
-    pictures |= {"plaster": plaster((0.86, 0.72, 0.50), 2), "rose": plaster((0.74, 0.47, 0.36), 3)}
-    pictures |= {"hours": hours(), "fields": fields(), "sky": sky()}
-    pictures |= {f"slopes_{k}": slopes(k) for k in range(2)}
-    pictures["stains"] = 0.5 + 0.2 * rough(160, 5, 4, rng)
-    pictures["ripples"] = 0.5 + 0.17 * (noise(160, (9, 9), rng) + 0.4 * noise(160, (24, 24), rng))
-    for name, picture in pictures.items():
-        save(folder / f"courtyard_{name}.jpg", picture)
     lines = [*sphere_of_rings(), *basin(), *smaller_things()]
     lines += arcade("north", (0, HALF), 0, 5) + arcade("west", (-HALF, 0), 90, 5)
     lines += [*upper_storey(), *roofs(rng), *east_wall(rng), *balustrade(), *potted_trees(rng)]
-    lines += landscape(rng)
     text = fragment(lines, "Made by courtyard.py: what stands in unbounded/courtyard.xml.")
     (folder / "courtyard_place.xml").write_text(text)
 
