@@ -1,15 +1,17 @@
 """Which cameras a plan has: those that the user asks for, if they see anything.
 
 Cameras around a room see the black backs of its walls, or the walls alone. A scene is taken for a
-room if more than half of what such cameras meet is black, if three quarters of them do not see
-the object, or if its own sensor stands enclosed and next to none of them sees that place. Unless
-somebody asked for cameras around the scene, they then are inside.
+room if more than half of what such cameras meet is black, if no light falls on it, if from three
+quarters of all places around the object it is not seen, or if the scene's own sensor stands
+enclosed and next to none of them sees that place. Unless somebody asked for cameras around the
+scene, they then are inside.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -24,11 +26,11 @@ from .rooms import is_enclosed
 from .sensors import SensorCamera
 from .shots import Shots
 from .subject import Subject
-from .survey import Survey, look, percent
+from .survey import Survey, look, percent, sees
 
 Array = np.ndarray[Any, Any]
 
-_DARKNESS, _BLINDNESS, _HIDDEN, _ENCLOSED = 0.5, 0.75, 0.9, 0.8
+_DARKNESS, _SEEING, _LIT, _HIDDEN, _ENCLOSED = 0.5, 0.25, 0.005, 0.9, 0.8
 _WORTH_A_WORD = 0.02  # darkness that is mentioned
 
 
@@ -107,20 +109,24 @@ def _inside(here: Situation, *notes: str) -> Choice:
 
 def _around(name: str, here: Situation, size: tuple[int, int], counts: dict[str, int]) -> Choice:
     """Cameras around the object, or inside if the scene is a room and nobody asked for others."""
-    chosen = shots.around(here.file, here.subject.box, here.up, size, counts, here.options)
+    seeing = None if here.subject.is_all else partial(sees, here.scene, here.subject)
+    chosen = shots.around(here.file, here.subject.box, here.up, size, counts, here.options, seeing)
     found = _surveyed(name, here, chosen, here.subject, hide=True)
     reason = _why_room(here, found)
     if reason is None:
         return found
     if not _wants_around(here):
-        return _inside(here, f"{reason}: this is a room, cameras are inside")
+        try:
+            return _inside(here, f"{reason}: this is a room, cameras are inside")
+        except InputError:
+            reason += ", but there is no room either"
     if found.survey.coverage == 0:
         raise InputError(
             f"protocol '{name}': {reason}, and none sees the object, expected {{}}",
             Option("protocol", "room"),
         )
     seen = percent(found.survey.coverage)
-    warning = f"warning: {reason}; {seen} of the pixels see the object; the protocol room is inside"
+    warning = f"warning: {reason}; {seen} of the pixels see the object"
     return _surveyed(name, here, chosen, here.subject, warning, hide=True)
 
 
@@ -132,6 +138,8 @@ def _surveyed(
     survey = look(here.scene, subject, poses, intrinsics, hide_emitters=hide)
     if survey.coverage == 0 and not notes:
         notes = ("warning: the cameras see nothing of the object",)
+    elif chosen.share < 1 - _WORTH_A_WORD and not notes:
+        notes = (f"{percent(1 - chosen.share)} of the places around it do not see the object",)
     elif survey.darkness > _WORTH_A_WORD and not notes:
         dark = percent(survey.darkness)
         notes = (f"{dark} of what the cameras see is the back of one-sided surfaces, black",)
@@ -147,8 +155,10 @@ def _why_room(here: Situation, found: Choice) -> str | None:
     if survey.darkness > _DARKNESS:
         dark = percent(survey.darkness)
         return f"{dark} of what cameras around the scene see is the black back of its surfaces"
-    if survey.blind >= _BLINDNESS and not here.subject.is_all:
-        return f"{percent(survey.blind)} of the cameras around the object do not see it"
+    if found.shots.share < _SEEING:
+        return f"{percent(1 - found.shots.share)} of the places around the object do not see it"
+    if survey.lit < _LIT and here.scene.emitters():
+        return "no light falls on what cameras around the scene see"
     sensor = here.sensor
     if sensor is None or not _stands_enclosed(here, sensor):
         return None

@@ -77,8 +77,8 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
 def _with_merged(box: Bounds, parts: Sequence[Part]) -> Bounds:
     """The box of all that is visible: Mitsuba forgets that of rectangles merged with meshes."""
     visible = [part for part in parts if not part.glows]
-    lower = np.min([box[0], *(part.lower for part in visible)], axis=0)
-    upper = np.max([box[1], *(part.upper for part in visible)], axis=0)
+    lower = np.min([np.array(box[0]), *(part.lower for part in visible)], axis=0)
+    upper = np.max([np.array(box[1]), *(part.upper for part in visible)], axis=0)
     return _triple(lower), _triple(upper)
 
 
@@ -123,7 +123,7 @@ def _about_sensors(sensors: Sequence[SensorCamera], choice: Choice) -> list[str]
         )
     here = [s for s in sensors if s.kind is None] if taken else sensors[:1]
     mirrored = [s.name for s in here if s.mirrored]
-    if mirrored:
+    if mirrored and (taken or choice.shots.cameras == "forward"):
         notes.append(f"mirrored: {', '.join(mirrored)}; pictures are not, x is turned round")
     notes += _about(
         "lens", [s for s in here if s.lens], taken, "transforms hold the pinhole in its centre"

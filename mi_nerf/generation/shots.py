@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,6 +23,9 @@ from .surfaces import depth_bounds, trace_surfaces
 
 Array = np.ndarray[Any, Any]
 
+Seeing = Callable[[Array, Intrinsics], Array]  # which of (N, 4, 4) poses see the object, (N,)
+
+_SPARE = 4  # places for each camera, of which some may not see the object
 _UNIT_BOX = 1.001  # a scene inside [-1, 1]^3, but for rounding, gets the paper's cameras,
 _SMALLEST = 0.4  # unless it is smaller than a fifth of that
 # Forward-facing views: how far cameras move sideways, per distance of the nearest content.
@@ -40,6 +43,7 @@ class Shots:
     views: tuple[View, ...]
     center: Array
     radius: float
+    share: float = 1.0  # of places around the object that see it
 
     def of(self, views: Sequence[View]) -> tuple[list[Array], list[Intrinsics]]:
         """Poses and intrinsics of views."""
@@ -56,32 +60,41 @@ def around(
     size: tuple[int, int],
     counts: dict[str, int],
     options: Options,
+    seeing: Seeing | None = None,
 ) -> Shots:
     """Cameras on a (hemi)sphere around the object.
 
     Args:
         box: The object's.
+        seeing: Which cameras see it; others are passed over, if there are enough.
     """
     center, radius = _center_and_radius(box, options)
     cameras = options.cameras or file.default("cameras") or "hemisphere"
     if cameras not in ("hemisphere", "sphere"):
         raise InputError(f"{file.path}: cameras '{cameras}', expected hemisphere or sphere")
     sphere: Cameras = "sphere" if cameras == "sphere" else "hemisphere"
-    views = []
+    intrinsics = Intrinsics.from_angle_x(*size, CAMERA_ANGLE_X)
+    elevation = _elevation(options)
+    views, seen, asked = [], 0, 0
     for split, count in counts.items():
+        places = count if seeing is None else _SPARE * count
         poses = viewpoints.around(
-            count,
+            places,
             split,
             options.seed,
             cameras=sphere,
             up=up,
             center=center,
             radius=radius,
-            elevation=_elevation(options),
+            elevation=elevation,
         )
-        views += [View(split, i, pose, options.seed) for i, pose in enumerate(poses)]
-    intrinsics = Intrinsics.from_angle_x(*size, CAMERA_ANGLE_X)
-    return Shots(sphere, intrinsics, tuple(views), center, radius)
+        if seeing is not None and count:
+            good = seeing(poses, intrinsics)
+            seen, asked = seen + int(good.sum()), asked + len(good)
+            poses = poses[good] if good.sum() >= count else poses
+        views += [View(split, i, pose, options.seed) for i, pose in enumerate(poses[:count])]
+    share = seen / asked if asked else 1.0
+    return Shots(sphere, intrinsics, tuple(views), center, radius, share)
 
 
 def _center_and_radius(box: Bounds, options: Options) -> tuple[Array, float]:

@@ -13,7 +13,7 @@ flat                             4        floors and walls are, unless the senso
 around the rest, as the sensor   4        domes, and rooms as one mesh
 not flat, the sensor frames the  8        the author looks at the rest, not at it
 rest
-around the rest, an open mesh    16       backdrops bend around what is before them
+around the rest, an open mesh    8        backdrops bend around what is before them
 anything else                    50       the ground may be a globe
 ===============================  =======  ================================================
 
@@ -36,7 +36,7 @@ from .sensors import SensorCamera
 
 Array = np.ndarray[Any, Any]
 
-_FLAT, _FRAMED, _OPEN, _WHOLE, _ANYTHING = 4.0, 8.0, 16.0, 20.0, 50.0
+_FLAT, _BENT, _WHOLE, _ANYTHING = 4.0, 8.0, 20.0, 50.0
 _FRAME = 1 / 8  # of the picture's smaller side that a thing spans which the sensor looks at
 _ASIDE = 64  # shapes at most that are set aside at once
 _PIECES = 64  # of a mesh of the surroundings that are looked at: of grass there are more
@@ -183,13 +183,13 @@ def _surrounds(part: Part, lower: Array, upper: Array, sensor: SensorCamera | No
     if part.normal is not None:
         whole = None if sensor is None else sensor.share_of_frame(part.lower, part.upper)
         return times >= _WHOLE or framed or share is None or whole is None or whole >= 1
-    if times >= _ANYTHING or (times >= _FRAMED and framed):
+    if times >= _ANYTHING or (times >= _BENT and framed):
         return True
     margin = 0.01 * part.size
     if not ((lower >= part.lower - margin).all() and (upper <= part.upper + margin).all()):
         return False
     if sensor is None:
-        return times >= _OPEN and is_open(part)
+        return times >= _BENT and is_open(part)
     where = sensor.pose[:3, 3]
     return bool((where >= part.lower).all() and (where <= part.upper).all())
 

@@ -12,6 +12,7 @@ from .scene_file import SceneFile
 
 _LOOKAT_UP = re.compile(r"""<look_?at\b[^>]*?\bup\s*=\s*["']([^"']*)["']""", re.IGNORECASE)
 _SENSOR = re.compile(r"<sensor\b.*?</sensor\s*>", re.IGNORECASE | re.DOTALL)
+_CAMERAS = ("perspective", "thinlens")  # of others a scale is the width of what they see
 _SCALE_TOLERANCE = 1e-4  # of the axes' lengths; Mitsuba refuses cameras that scale
 
 
@@ -46,8 +47,7 @@ def _unpack_batches(state: Any) -> list[str]:
             root[key] = mi.Properties.ResolvedReference(index)
             continue
         members = _objects(state, batch, mi.ObjectType.Sensor)
-        name = batch.id() or key
-        notes.append(f"sensor '{name}', a batch, unpacked into its {len(members)} sensors")
+        notes.append(f"{_name(batch)}, a batch, is unpacked into its {len(members)} sensors")
         for number, (_, member) in enumerate(members):
             root[f"{key}_{number}"] = mi.Properties.ResolvedReference(member)
             _share(state, batch, state.nodes[member].props, len(members), films)
@@ -78,7 +78,7 @@ def _unscale(state: Any) -> list[str]:
 
     notes = []
     for node in state.nodes:
-        if node.type != mi.ObjectType.Sensor or "to_world" not in node.props:
+        if node.props.plugin_name() not in _CAMERAS or "to_world" not in node.props:
             continue
         matrix = np.array(node.props["to_world"].matrix, np.float64)
         axes = matrix[:3, :3]
@@ -88,7 +88,7 @@ def _unscale(state: Any) -> list[str]:
             continue  # nothing that a camera could be made of: Mitsuba says so
         matrix[:3, :3] = _orthonormal(axes)
         node.props["to_world"] = mi.ScalarTransform4d(matrix.tolist())
-        notes.append(f"sensor '{node.props.id()}': its to_world scales, taken without the scale")
+        notes.append(f"{_name(node.props)}: its to_world scales, which is left out")
     return notes
 
 
@@ -99,6 +99,10 @@ def _orthonormal(axes: Any) -> Any:
     upward /= np.linalg.norm(upward)
     left = np.cross(upward, forward) * np.sign(np.linalg.det(axes))
     return np.stack([left, upward, forward], axis=1)
+
+
+def _name(props: Any) -> str:
+    return f"sensor '{props.id()}'" if props.id() else "a sensor"
 
 
 def _objects(state: Any, props: Any, kind: Any) -> list[tuple[str, int]]:

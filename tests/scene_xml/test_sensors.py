@@ -54,7 +54,9 @@ def test_batches_are_unpacked_in_their_place(tmp_path: Path) -> None:
     one = pinhole(1).format(film=FILM.format(8, 8))
     four = pinhole(4).format(film=FILM.format(9, 9))
     file = write(tmp_path, one, batch, four)
-    assert separate_sensors(file.state) == ["sensor 'both', a batch, unpacked into its 2 sensors"]
+    assert separate_sensors(file.state) == [
+        "sensor 'both', a batch, is unpacked into its 2 sensors"
+    ]
     scene = file.load()
     assert places(scene) == pytest.approx([1, 2, 3, 4])
     sizes = [tuple(int(n) for n in sensor.film().size()) for sensor in scene.sensors()]
