@@ -66,14 +66,12 @@ def mountains(number: int) -> tuple[Array, Array, Array, Array]:
 
     Normals point up more than the surface does: haze shines from within.
     """
-    distance, top, seed = ((760.0, 50.0, 11), (1150.0, 165.0, 17))[number]
+    distance, top, seed = ((760.0, 46.0, 11), (1150.0, 125.0, 17))[number]
     columns = 200
     angle = np.linspace(0, 2 * np.pi, columns + 1)
     x, y = np.sin(angle), np.cos(angle)
-    crest = 1 + 0.6 * waves(2.3 * x, 2.3 * y, seed) + 0.32 * waves(7 * x, 7 * y, seed + 1)
-    crest = top * (
-        crest + 0.12 * waves(21 * x, 21 * y, seed + 2) + 0.05 * waves(53 * x, 53 * y, seed + 3)
-    )
+    crest = 1 + 0.45 * waves(2.3 * x, 2.3 * y, seed) + 0.25 * waves(7 * x, 7 * y, seed + 1)
+    crest = top * np.maximum(crest + 0.09 * waves(19 * x, 19 * y, seed + 2), 0.2)
     v = np.array([0.0, 0.35, 0.7, 1.0])[:, None]
     away = distance * (1 + 0.1 * v + 0.02 * waves(25 * x, 25 * y + 3 * v, seed + 4) * (1 - v))
     z = -60 + (crest + 60) * v
