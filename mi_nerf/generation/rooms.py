@@ -30,6 +30,7 @@ _ENCLOSED = 0.6  # share of directions that meet something, inside a room
 _DARK = 0.03  # of which those that meet the back of a wall are at most so many
 _CLEAR = 0.15  # distance from all surfaces, per typical distance of the walls
 _FEWEST = 64  # places, below which cameras may stand nearer to surfaces
+_SMALL = 1 / 4  # of the volume searched, below which it is searched again, closer around the room
 _NEAREST = 1 / 8  # of that distance, at least
 _HUBS, _ROUNDS = 24, 3  # places from which others are seen, around how many corners
 _TRIES, _GRID = 12, 8  # directions tried for a camera, rays along each side of its film
@@ -107,24 +108,56 @@ def find_room(scene: Any, box: Bounds, up: Array, start: Array | None, seed: int
     enclosed = start is not None and is_enclosed(scene, start, _ENCLOSED)
     if enclosed:
         box = _nearby(scene, box, np.asarray(start))
+    known = _room_in(scene, box, start if enclosed else None, seed)
+    # What is seen through a window is many times larger: few places would be in the room.
+    around = known.around(box)
+    while _volume(around) < _SMALL * _volume(box):
+        box, known = around, _room_in(scene, around, known.start, seed)
+        around = known.around(box)
+    room, near = known.places, known.distances.min(axis=1)
+    clear = _CLEAR * float(np.median(np.median(known.distances, axis=1)))
+    least = _NEAREST * clear
+    while clear > least and (near >= clear).sum() < _FEWEST:
+        clear *= 0.8
+    if not (near >= clear).any():
+        raise InputError("protocol 'room': no place in it is clear of surfaces, expected a room")
+    return Room(scene, box, up, known.hubs, room[near >= clear].mean(axis=0), clear)
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """Places in a room, and distances all around them."""
+
+    places: Array  # (N, 3)
+    distances: Array  # (N, directions)
+    hubs: Array  # (H, 3)
+    start: Array  # (3,) where the search began
+
+    def around(self, box: Bounds) -> Bounds:
+        """The part of a box that the room can fill, as far as these places show."""
+        reach = float(np.median(self.distances))
+        lower = np.maximum(box[0], self.places.min(axis=0) - reach)
+        upper = np.minimum(box[1], self.places.max(axis=0) + reach)
+        return tuple(lower.tolist()), tuple(upper.tolist())
+
+
+def _room_in(scene: Any, box: Bounds, start: Array | None, seed: int) -> _Known:
+    """The room around a point that is enclosed, or else the most spacious one in a box."""
     points = _points(box, _PLACES, seed, 3, 0)
-    if enclosed:
+    if start is not None:
         points = np.concatenate([np.asarray(start)[None], points])
     inside = points[_inside(scene, points, 0.0)]
     if not len(inside):
         raise InputError("protocol 'room': no place in the scene is enclosed, expected a room")
     distances = _distances(scene, inside)
     typical = np.median(distances, axis=1)
-    first = 0 if enclosed and (inside[0] == start).all() else int(np.argmax(typical))
+    first = 0 if start is not None and (inside[0] == start).all() else int(np.argmax(typical))
     hubs, reached = _reachable(scene, inside, first)
-    room, near = inside[reached], distances[reached].min(axis=1)
-    clear = _CLEAR * float(np.median(typical[reached]))
-    least = _NEAREST * clear
-    while clear > least and (near >= clear).sum() < _FEWEST:
-        clear *= 0.8
-    if not (near >= clear).any():
-        raise InputError("protocol 'room': no place in it is clear of surfaces, expected a room")
-    return Room(scene, box, up, hubs, room[near >= clear].mean(axis=0), clear)
+    return _Known(inside[reached], distances[reached], hubs, inside[first])
+
+
+def _volume(box: Bounds) -> float:
+    return float(np.prod(np.subtract(box[1], box[0])))
 
 
 def is_enclosed(scene: Any, point: Array, share: float) -> bool:
@@ -189,11 +222,13 @@ def _reachable(scene: Any, points: Array, first: int) -> tuple[Array, Array]:
 
 
 def _seen(scene: Any, points: Array, hubs: Array) -> Array:
-    """Which points are seen from any of the hubs, (N,)."""
-    seen = np.zeros(len(points), bool)
-    for hub in hubs:
-        left = np.flatnonzero(~seen)
-        if left.size:
-            origin = np.broadcast_to(hub, (left.size, 3))
-            seen[left] = ~blocked(scene, origin, points[left])
-    return seen
+    """Which points are seen from any of the hubs, (N,).
+
+    All in one: each tracing of rays through a scene of many materials takes half a second
+    before the first ray.
+    """
+    if not len(points):
+        return np.zeros(0, bool)
+    origins = np.repeat(hubs, len(points), axis=0)
+    hidden = blocked(scene, origins, np.tile(points, (len(hubs), 1)))
+    return np.asarray(~hidden.reshape(len(hubs), len(points)).all(axis=0))

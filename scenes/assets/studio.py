@@ -538,7 +538,7 @@ def plants(rng: np.random.Generator) -> list[str]:
 
 def street(rng: np.random.Generator) -> list[str]:
     """Houses on the other side of the street, roofs behind them, and a tree."""
-    out = [block("street", (-60, 3.5, -9.2), (60, 60, -9.0), "pavement")]
+    out: list[str] = []
     x, k = -34.0, 0
     while x < 34:
         wide, high = rng.uniform(5.5, 9), rng.uniform(1.2, 4.6)
