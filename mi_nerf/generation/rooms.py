@@ -74,7 +74,7 @@ class Room:
         hits = first_hits(self.scene, o.reshape(-1, 3), d.reshape(-1, 3), hide_emitters=False)
         shape = (count, _TRIES, _GRID**2)
         lit = hits.something & ~hits.dark
-        open_view = (hits.nearest > 2 * self.clear).reshape(shape).mean(axis=-1)
+        open_view = (hits.nearest > 6 * self.clear).reshape(shape).mean(axis=-1)
         score = lit.reshape(shape).mean(axis=-1) + np.minimum(open_view, 0.8)
         # The first direction that is about as good as any: others serve as well as they differ.
         good = score >= score.max(axis=1, keepdims=True) - 0.05

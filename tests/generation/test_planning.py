@@ -392,7 +392,10 @@ def test_the_command_plans_and_then_generates(
         (["--object", "ball", "tabel"], "--object tabel: no such shape, expected one of ball, box"),
         (["--cameras", "scene", "--radius", "1"], "--radius: has no meaning for the scene's own"),
         (["--cameras", "scene", "--train", "9"], "--train 9, --val 0, --test 0: the scene has 1"),
-        (["--cameras", "scene", "--size", "9", "9"], "--size 9 9: the film of sensor 'it' is 32x24"),
+        (
+            ["--cameras", "scene", "--size", "9", "9"],
+            "--size 9 9: the film of sensor 'it' is 32x24",
+        ),
     ],
 )
 def test_bad_options(

@@ -79,7 +79,17 @@ def test_what_is_enclosed(found: Room) -> None:
 def test_the_room_in_which_the_sensor_stands(tmp_path: Path) -> None:
     """Two rooms, walls of both sides alike: nothing else tells which."""
     second = room(TWO_SIDED).replace('id="', 'id="second_')
-    for name in ("ground", "ceiling", "left", "right", "back", "front", "table", "cupboard", "lamp"):
+    for name in (
+        "ground",
+        "ceiling",
+        "left",
+        "right",
+        "back",
+        "front",
+        "table",
+        "cupboard",
+        "lamp",
+    ):
         start = second.index(f'id="second_{name}"')
         end = second.index("</transform>", start)
         second = second[:end] + '<translate x="10"/>' + second[end:]

@@ -112,6 +112,7 @@ def test_backdrops_that_are_not_flat(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mi_nerf.generation.subject.is_open", lambda part: True)
     assert found([BALL, cyclorama]) == {"cyclorama"}
     assert found([BALL, box("bowl", (0, 0, 0.5), 3)]) == set()
+    monkeypatch.undo()
     smaller = box("cyclorama", (0, 1, 1.5), (9, 6, 4))
     assert found([BALL, smaller]) == set()
     assert found([BALL, smaller], camera((0, -6, 1))) == {"cyclorama"}  # the sensor frames the ball

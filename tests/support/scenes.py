@@ -90,6 +90,8 @@ def _upright(x: float, y: float, turn: str, place: str) -> str:
 
 
 def _block(name: str, half: tuple[float, float, float], center: tuple[float, float, float]) -> str:
-    sizes, places = (" ".join(f'{a}="{v}"' for a, v in zip("xyz", n, strict=True)) for n in (half, center))
+    sizes, places = (
+        " ".join(f'{a}="{v}"' for a, v in zip("xyz", n, strict=True)) for n in (half, center)
+    )
     transform = f'<transform name="to_world"><scale {sizes}/><translate {places}/></transform>'
     return f'<shape type="cube" id="{name}">{transform}{GRAY}</shape>'
