@@ -41,19 +41,22 @@ def generate(
     scene: str | Path,
     out: str | Path,
     *,
-    protocol: Literal["realistic360", "diffuse360", "forward"] | None = None,
+    protocol: Literal["realistic360", "diffuse360", "forward", "room"] | None = None,
     train: int | None = None,
     val: int | None = None,
     test: int | None = None,
     size: tuple[int, int] | None = None,
     spp: int | None = None,
     seed: int = 0,
-    cameras: Literal["hemisphere", "sphere"] | None = None,
-    up: Literal["x", "y", "z"] | None = None,
+    cameras: Literal["hemisphere", "sphere", "scene"] | None = None,
+    up: str | tuple[float, float, float] | None = None,
     center: tuple[float, float, float] | None = None,
     radius: float | None = None,
+    elevation: tuple[float, float] | None = None,
+    object: str | Sequence[str] | None = None,
     parameters: Mapping[str, str] | None = None,
     resume: bool = False,
+    plan: bool = False,
     variant: str | None = None,
     show: bool = True,
 ) -> dict[str, Any]:
@@ -67,14 +70,22 @@ def generate(
         size: width and height in pixels.
         spp: samples a pixel; default: those of the scene's sampler.
         seed: of camera positions and of the noise.
-        cameras, up, center, radius: where 360-degree cameras stand, in scene units.
+        cameras, center, radius: where 360-degree cameras stand, in scene units; ``"scene"``
+            takes the scene's own sensors.
+        elevation: between which angles over the horizon of ``center``, in degrees.
+        up: vertical axis, ``"y"`` or ``"-z"``, or direction; default: as the scene's sensor or
+            its base shows.
+        object: ids of the shapes that cameras look at; default: all but what surrounds them.
         parameters: values of the scene's ``$parameters``.
+        plan: only draw where the cameras would stand: ``cameras.png`` in ``out``, or ``out``
+            itself where it is the name of a picture. Nothing is rendered.
         show: say what is made, and how far it is.
 
     Returns:
         The content of ``dataset.json``. ``complete`` is false after an interruption;
         ``["noise"]["test"]["psnr_ceiling"]`` is the PSNR in dB that the converged images
-        themselves would get.
+        themselves would get. With ``plan``: its settings, ``notes`` for people, ``coverage``,
+        the share of pixels that the object covers, and ``picture``, where it is.
 
     Raises:
         InputError: if anything is not as expected; existing files are as they were.
@@ -95,8 +106,14 @@ def generate(
         up=up,
         center=center,
         radius=radius,
+        elevation=elevation,
+        object=(object,) if isinstance(object, str) else tuple(object or ()) or None,
     )
     path = find_scene(str(scene))
+    if plan:
+        return generation.preview(
+            path, out, active_variant(variant), options, parameters=parameters, show=show
+        )
     return generation.generate(
         path,
         out,

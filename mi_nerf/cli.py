@@ -19,7 +19,7 @@ from .commands.shared import flag
 from .commands.usage import unknown_command, usage_error
 from .training.run import TrainingError
 
-_LISTS = ("--set", "--vary")  # options that may be followed by several values
+_LISTS = ("--set", "--vary", "--object")  # options that may be followed by several values
 
 
 def main(argv: Sequence[str] | None = None) -> int:

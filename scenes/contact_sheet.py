@@ -2,7 +2,7 @@
 
     python scenes/contact_sheet.py docs/scenes.jpg
 
-Each scene from its own sensor, over white, six in a row.
+Each scene from its own sensor, over white, five in a row.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from mi_nerf.base.variants import choose_variant
 from mi_nerf.images.write import on_white
 from mi_nerf.scene_xml.scene_file import SceneFile
 
-GROUPS = ("realistic", "diffuse", "forward", "hard")
-COLUMNS, TILE, SUPERSAMPLING, SPP = 6, 200, 2, 128
+GROUPS = ("realistic", "diffuse", "forward", "unbounded", "hard")
+COLUMNS, TILE, SUPERSAMPLING, SPP = 5, 200, 2, 128
 
 
 def main() -> None:

@@ -9,6 +9,7 @@ from typing import Annotated, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from ..api import generate
+from ..base.errors import InputError
 from ..base.variants import choose_variant
 from ..generation import Options
 from ..generation.run import summary
@@ -27,6 +28,10 @@ class Generate:
 
     mi-nerf generate my_scene.xml data/mine --up y --cameras sphere --seed 1
 
+    mi-nerf generate my_scene.xml data/mine --cameras scene
+
+    mi-nerf generate my_scene.xml data/mine --object teapot --plan
+
     mi-nerf generate bonsai data/bonsai --resume
     """
 
@@ -34,30 +39,36 @@ class Generate:
     """A Mitsuba XML file, or the name of a scene that comes with mi_nerf."""
     out: Positional[Annotated[Path, arg(metavar="OUT")]]
     """Folder of the dataset: new or empty, or with --resume one that was begun."""
-    protocol: Literal["realistic360", "diffuse360", "forward"] | None = None
-    """The paper's kind of dataset; default: the scene's own, or realistic360."""
+    protocol: Literal["realistic360", "diffuse360", "forward", "room"] | None = None
+    """Kind of dataset; default: the scene's own, or realistic360, or room where that sees walls."""
     train: int | None = None
-    """Training views; default: the protocol's (100, 479, 28)."""
+    """Training views; default: the protocol's (100, 479, 28, 100)."""
     val: int | None = None
-    """Validation views (10, 10, 0)."""
+    """Validation views (10, 10, 0, 10)."""
     test: int | None = None
-    """Test views (200, 1000, and for forward every eighth of all)."""
+    """Test views (200, 1000, every eighth of all, 50); of the scene's sensors every eighth."""
     size: tuple[int, int] | None = None
-    """Width and height (800 800, 512 512, 1008 756)."""
+    """Width and height (800 800, 512 512, 1008 756, 800 600); of sensors that of their film."""
     spp: int | None = None
     """Samples a pixel; default: those of the scene's sampler."""
     seed: int = 0
     """Seed of camera positions and of the noise."""
     resume: bool = False
     """Go on with the dataset in OUT; missing and damaged views are made again."""
-    cameras: Literal["hemisphere", "sphere"] | None = None
-    """Where 360-degree cameras stand; default: as the scene says, or hemisphere."""
-    up: Literal["x", "y", "z"] | None = None
-    """Vertical axis; default: that of the scene's sensor, or z."""
+    cameras: Literal["hemisphere", "sphere", "scene"] | None = None
+    """Where cameras stand; default: as the scene says, or hemisphere; scene: its own sensors."""
+    up: tuple[str, ...] | None = None
+    """Vertical axis, x, y, z or --up=-y, or a direction; default: as sensor or base show."""
+    object: UseAppendAction[tuple[str, ...]] = ()
+    """Ids of the shapes that cameras look at; default: all but what surrounds them."""
     center: tuple[float, float, float] | None = None
-    """What cameras look at; default: the origin, or the middle of scenes beyond [-1, 1]^3."""
+    """What cameras look at; default: the origin, or the middle of objects beyond [-1, 1]^3."""
     radius: float | None = None
     """Distance from it (forward: how far cameras move); default: 4, or as the scene's size says."""
+    elevation: tuple[float, float] | None = None
+    """Lowest and highest angle of 360-degree cameras over its horizon, degrees; default: all."""
+    plan: bool = False
+    """Only draw the cameras: OUT/cameras.png, or OUT if it ends so; renders nothing."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Values of the scene's $parameters: name=value; repeatable."""
     variant: Variant = None
@@ -65,15 +76,33 @@ class Generate:
     def run(self, _started: float) -> None:
         """Generates."""
         options = {field.name: getattr(self, field.name) for field in fields(Options)}
+        options["up"] = _direction(self.up)
+        options["object"] = self.object or None
         record = generate(
             self.scene,
             self.out,
             **options,
             parameters=dict(name_and_value(text) for text in self.set),
             resume=self.resume,
+            plan=self.plan,
             variant=choose_variant(self.variant),
         )
+        if self.plan:
+            print(f"{record['picture']}: the cameras, from above and from the side")
+            return
         hint = "" if record["complete"] else ", go on with --resume"
         print(f"{self.out}: {summary(record)}{hint}")
         if not record["complete"]:
             raise KeyboardInterrupt
+
+
+def _direction(up: tuple[str, ...] | None) -> str | tuple[float, float, float] | None:
+    """The value of --up: one name of an axis, or three numbers."""
+    if up is None or len(up) == 1:
+        return up and up[0]
+    try:
+        x, y, z = (float(word) for word in up)
+    except ValueError:
+        message = f"--up {' '.join(up)}: expected x, y, z, -x, -y, -z or three numbers"
+        raise InputError(message) from None
+    return x, y, z

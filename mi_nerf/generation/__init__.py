@@ -1,7 +1,8 @@
 """Path-traced datasets from Mitsuba scenes: ``mi-nerf generate``."""
 
-from .plan import Plan, make_plan
+from .plan import Plan
+from .planning import make_plan
 from .protocol import PROTOCOLS, Options, Protocol
-from .run import generate
+from .run import generate, preview
 
-__all__ = ["PROTOCOLS", "Options", "Plan", "Protocol", "generate", "make_plan"]
+__all__ = ["PROTOCOLS", "Options", "Plan", "Protocol", "generate", "make_plan", "preview"]

@@ -34,7 +34,7 @@ def write_view(folder: Path, view: View, traced: TracedView, plan: Plan) -> dict
     write_exr(_with(stem, ".exr"), image)
     write_exr(_with(stem, "_depth.exr"), traced.depth)
     write_exr(_with(stem, "_normal.exr"), traced.normal)
-    bounds = depth_bounds(plan.intrinsics, traced.depth)
+    bounds = depth_bounds(plan.camera_of(view), traced.depth)
     return {
         "noise": estimate(*traced.halves, samples).record(),
         "depth_bounds": None if bounds is None else list(bounds),
@@ -68,7 +68,7 @@ def write_transforms(folder: Path, plan: Plan) -> None:
             frames = [_frame(view) for view in views]
             write_json(
                 folder / f"transforms_{split}.json",
-                {**_camera(plan.intrinsics), "aabb": plan.box, "frames": frames},
+                {**_camera(plan.intrinsics), "aabb": plan.region, "frames": frames},
             )
 
 
@@ -104,7 +104,11 @@ def poses_bounds(poses: Array, intrinsics: Intrinsics, bounds: Array) -> Array:
 
 
 def _frame(view: View) -> dict[str, Any]:
+    own = {} if view.intrinsics is None else _camera(view.intrinsics)
+    if view.lens is not None:
+        own["lens"] = {"aperture_radius": view.lens.radius, "focus_distance": view.lens.focus}
     return {
+        **own,
         "file_path": f"./{view.name}",
         "transform_matrix": view.pose.tolist(),
         "depth_file_path": f"./{view.name}_depth.exr",

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,14 @@ from ..base.interrupts import interruptible
 from ..base.machine import versions
 from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
-from ..scene_xml.scene_file import SceneFile, visible_bounds
+from ..scene_xml.scene_file import Bounds, SceneFile, visible_bounds
 from ..scene_xml.scene_file import quiet as _quiet
+from ..scene_xml.sensors import separate_sensors
+from .hints import with_hints
 from .output import is_intact, write_forward_capture, write_transforms, write_view
-from .plan import Plan, View, make_plan, protocol_name
+from .plan import Plan, View
+from .plan_picture import PICTURE, draw
+from .planning import make_plan, protocol_name
 from .protocol import SPLITS, Options
 from .tracer import Tracer
 
@@ -76,6 +81,48 @@ def generate(
         return _trace_views(folder, tracer, plan, record, show)
 
 
+def preview(
+    scene: str | Path,
+    out: str | Path,
+    variant: str,
+    options: Options | None = None,
+    *,
+    parameters: Mapping[str, str] | None = None,
+    show: bool = True,
+) -> dict[str, Any]:
+    """Draws the cameras that :func:`generate` would have, and renders nothing.
+
+    Args:
+        out: The dataset's folder, which gets ``cameras.png``, or the picture's own name. Nothing
+            else is written.
+        show: Say what would be made.
+
+    Returns:
+        The settings of ``dataset.json``, and ``coverage``, the share of pixels that the object
+        covers, ``notes``, and ``picture``, where it is.
+
+    Raises:
+        InputError: if anything is not as expected.
+    """
+    out = Path(out)
+    picture = out if out.suffix.lower() == ".png" else out / PICTURE
+    check_folder(picture.parent)
+    with using_variant(variant):
+        with _quiet():
+            file = SceneFile(scene, parameters)
+            plan = _plan(file, options or Options())[-1]
+    if show:
+        print(*file.notes, plan, sep="\n", flush=True)
+    make_folder(picture.parent)
+    draw(plan, picture)
+    return {
+        **plan.record(),
+        "coverage": plan.survey.coverage,
+        "notes": list(plan.notes),
+        "picture": str(picture),
+    }
+
+
 def summary(record: dict[str, Any]) -> str:
     """What a finished or interrupted dataset holds, in one line."""
     done, wanted = len(record["views"]), sum(record["settings"]["views"].values())
@@ -100,7 +147,7 @@ def ceilings(record: dict[str, Any]) -> str:
 
 def _check_output(folder: Path, resume: bool) -> None:
     check_folder(folder)
-    if not folder.exists() or not any(folder.iterdir()):
+    if not folder.exists() or {path.name for path in folder.iterdir()} <= {PICTURE}:
         return
     if not resume:
         message = "{}: holds files already, expected a new or empty folder"
@@ -115,13 +162,33 @@ def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
     """Loads the scene and decides what to make of it."""
     import mitsuba as mi
 
+    file, scene, plan = _plan(file, options)
+    has_sampler = bool(file.plugins("Sampler")) and bool(file.plugins("Sensor"))
+    sampler = scene.sensors()[0].sampler() if has_sampler else mi.load_dict({"type": "independent"})
+    _check_sampler(sampler, plan)
+    return Tracer(scene, scene.integrator(), sampler, plan), plan
+
+
+def _plan(file: SceneFile, options: Options) -> tuple[SceneFile, Any, Plan]:
+    """The file as it was loaded, its scene, and what to make of it."""
+    options = with_hints(file, options)
+    hide = protocol_name(file, options) not in ("forward", "room")
+    notes, scene, box = _load(file, hide)
+    plan = make_plan(file, scene, box, options)
+    if plan.hide_emitters != hide:  # it is a room: its lamps are part of it
+        file = SceneFile(file.path, file.parameters)
+        _, scene, _ = _load(file, plan.hide_emitters)
+    return file, scene, replace(plan, notes=(*notes, *plan.notes))
+
+
+def _load(file: SceneFile, hide_emitters: bool) -> tuple[list[str], Any, Bounds]:
+    """What was changed of the scene, the scene, and the box of what is visible in it."""
     file.substitute("Film", "Integrator", "ReconstructionFilter", "Sampler", "Sensor")
     file.complete()
-    hide = protocol_name(file, options) != "forward"
-    integrators = file.plugins("Integrator")
-    if hide:
-        for properties in integrators:
+    if hide_emitters:
+        for properties in file.plugins("Integrator"):
             properties["hide_emitters"] = True
+    notes = separate_sensors(file.state)
     scene = file.load()
     media = (shape.interior_medium() for shape in scene.shapes())
     if not scene.emitters() and not any(hasattr(medium, "field") for medium in media):
@@ -129,14 +196,7 @@ def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
     box = visible_bounds(scene)
     if box is None or not np.ptp(np.array(box), axis=0).any():
         raise InputError(f"{file.path}: its box is empty, expected shapes that can be seen")
-    plan = make_plan(file, scene, box, options)
-    integrator = scene.integrator()
-    if not integrators:
-        integrator = mi.load_dict({"type": "path", "hide_emitters": hide})
-    has_sampler = bool(file.plugins("Sampler")) and bool(file.plugins("Sensor"))
-    sampler = scene.sensors()[0].sampler() if has_sampler else mi.load_dict({"type": "independent"})
-    _check_sampler(sampler, plan)
-    return Tracer(scene, integrator, sampler, plan), plan
+    return notes, scene, box
 
 
 def _check_sampler(sampler: Any, plan: Plan) -> None:

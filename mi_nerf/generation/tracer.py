@@ -9,10 +9,10 @@ import numpy as np
 
 from ..base.arrays import Image
 from ..base.errors import InputError
-from ..cameras.pinhole import sensor_dict
 from ..cameras.poses import mitsuba_from_opengl
 from ..scene_xml.refusals import refused_rendering
 from .plan import Plan, View
+from .sensors import camera_dict
 from .surfaces import trace_surfaces
 
 # Samples that one call of mi.render traces at most: bounds its memory, and the time
@@ -34,14 +34,9 @@ class Tracer:
 
     def __init__(self, scene: Any, integrator: Any, sampler: Any, plan: Plan) -> None:
         """``sampler`` must take each of ``plan.halves``."""
-        import mitsuba as mi
-
         self._scene, self._integrator, self._plan = scene, integrator, plan
-        description = sensor_dict(
-            plan.intrinsics, np.eye(4), near_clip=1e-3 * plan.scale, far_clip=1e3 * plan.scale
-        )
-        self._sensor = mi.load_dict({**description, "sampler": sampler})
-        self._parameters = mi.traverse(self._sensor)
+        self._sampler = sampler
+        self._sensors: dict[Any, Any] = {}  # for each kind of camera in the plan
         # Other samplers spread their points over all samples of a pixel.
         self._in_parts = sampler.class_name() == "IndependentSampler"
 
@@ -54,12 +49,13 @@ class Tracer:
         import mitsuba as mi
 
         pose = mi.ScalarTransform4f(mitsuba_from_opengl(view.pose).tolist())
-        self._parameters["to_world"] = mi.Transform4f(pose)
-        self._parameters.update()
+        parameters = mi.traverse(self._sensor(view))
+        parameters["to_world"] = mi.Transform4f(pose)
+        parameters.update()
         a, b = (self._half(view, half, n) for half, n in enumerate(self._plan.halves))
         depth, normal = trace_surfaces(
             self._scene,
-            self._plan.intrinsics,
+            self._plan.camera_of(view),
             view.pose,
             hide_emitters=self._plan.hide_emitters,
         )
@@ -70,7 +66,7 @@ class Tracer:
         total: Any = 0.0
         parts = passes(samples, self._plan.pixels) if self._in_parts else [samples]
         for i, count in enumerate(parts):
-            total = total + self._render(count, view.render_seed(half, i)) * np.float32(count)
+            total = total + self._render(view, count, view.render_seed(half, i)) * np.float32(count)
         image = total / np.float32(samples)
         image = image[..., :4]  # what follows are AOVs
         bad = int((~np.isfinite(image)).any(axis=-1).sum())
@@ -78,13 +74,23 @@ class Tracer:
             raise InputError(f"view {view.name}: {bad} pixels are NaN or infinite")
         return image
 
-    def _render(self, spp: int, seed: int) -> Image:
+    def _sensor(self, view: View) -> Any:
+        """The sensor that views of this kind share; it is moved from one to the next."""
+        import mitsuba as mi
+
+        kind = (self._plan.camera_of(view), view.lens)
+        if kind not in self._sensors:
+            description = camera_dict(*kind, self._plan.clips)
+            self._sensors[kind] = mi.load_dict({**description, "sampler": self._sampler})
+        return self._sensors[kind]
+
+    def _render(self, view: View, spp: int, seed: int) -> Image:
         import mitsuba as mi
 
         try:
             image = mi.render(
                 self._scene,
-                sensor=self._sensor,
+                sensor=self._sensor(view),
                 integrator=self._integrator,
                 spp=spp,
                 seed=seed,

@@ -18,6 +18,7 @@ Array = np.ndarray[Any, Any]
 
 _PLASTIC = 1.32471795724474602596  # the real root of x^3 = x + 1
 _STEP = np.array([1 / _PLASTIC, 1 / _PLASTIC**2])
+_STEP_3 = 1.22074408460575947536 ** -np.arange(1.0, 4)  # the real root of x^4 = x + 1
 
 # Sines of elevation. Not quite the pole, where "upright" means nothing, nor quite the
 # horizon, where a ground plane is a line.
@@ -33,6 +34,12 @@ def unit_square(count: int, seed: int, stream: int) -> Array:
     return (start + np.arange(count)[:, None] * _STEP) % 1.0
 
 
+def unit_cube(count: int, seed: int, stream: int, first: int = 0) -> Array:
+    """``count`` points of the R3 sequence in [0, 1)³, (count, 3), from number ``first`` on."""
+    start = np.random.default_rng([seed, stream]).random(3)
+    return (start + np.arange(first, first + count)[:, None] * _STEP_3) % 1.0
+
+
 def around(
     count: int,
     split: str,
@@ -42,6 +49,7 @@ def around(
     up: Array,
     center: Array,
     radius: float,
+    elevation: tuple[float, float] | None = None,
 ) -> Array:
     """OpenGL poses on a (hemi)sphere, uniform in area, that look at its centre, (count, 4, 4).
 
@@ -50,12 +58,16 @@ def around(
         cameras: ``"hemisphere"`` (above ``center``) or ``"sphere"``.
         up: Vertical unit vector.
         radius: Distance from ``center``.
+        elevation: The part of the sphere between these angles over its horizon, in degrees,
+            whatever ``cameras`` is.
     """
-    low = _LOWEST[cameras]
+    low, high = _LOWEST[cameras], _HIGHEST
+    if elevation is not None:
+        low, high = (math.sin(math.radians(angle)) for angle in elevation)
     side, front = horizontal_axes(up)
     poses = []
     for u, v in unit_square(count, seed, _SPLIT_SEEDS[split]):
-        height = low + (_HIGHEST - low) * u
+        height = low + (high - low) * u
         level = math.sqrt(1 - height * height)
         angle = 2 * math.pi * v
         out = level * (math.cos(angle) * side + math.sin(angle) * front) + height * up
@@ -81,6 +93,6 @@ def horizontal_axes(up: Array) -> tuple[Array, Array]:
     """Two unit vectors that make a right-handed frame with ``up``: side, front, up."""
     side = np.cross(up, [0.0, 0.0, 1.0])
     if np.linalg.norm(side) < 0.5:
-        side = np.array([1.0, 0.0, 0.0])
+        side = np.array([1.0, 0.0, 0.0]) - up[0] * np.asarray(up)
     side /= np.linalg.norm(side)
     return side, np.cross(up, side)

@@ -44,6 +44,22 @@ def test_cameras_stand_on_the_sphere_and_look_inwards(
         assert (offset @ up > 0).all()
 
 
+@given(st.floats(-80, 80), st.floats(0, 40), st.sampled_from(["hemisphere", "sphere"]))
+def test_elevation_is_between_two_angles(low: float, more: float, cameras: str) -> None:
+    """Whatever part of the sphere was asked for; the horizontal angle is as without."""
+    high = min(low + more, 80.0)
+    options = {"cameras": cameras, "up": AXES[1], "center": np.ones(3), "radius": 2.0}
+    poses = around(30, "train", 3, **options, elevation=(low, high))
+    offset = (poses[:, :3, 3] - 1) / 2
+    angle = np.degrees(np.arcsin(offset @ AXES[1]))
+    assert (angle >= low - 1e-6).all() and (angle <= high + 1e-6).all()
+    assert np.ptp(angle) >= 0.8 * (high - low) - 1e-6
+    side, front = horizontal_axes(AXES[1])
+    free = (around(30, "train", 3, **options)[:, :3, 3] - 1) / 2
+    turns = [np.arctan2(at @ front, at @ side) for at in (offset, free)]
+    assert np.cos(turns[0] - turns[1]) == pytest.approx(1)
+
+
 @given(st.integers(0, 1000), st.integers(1, 60))
 def test_fewer_are_the_first_of_more(seed: int, count: int) -> None:
     more = unit_square(100, seed, 0)

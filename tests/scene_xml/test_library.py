@@ -6,6 +6,7 @@ import subprocess
 import sys
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -16,6 +17,7 @@ from mi_nerf.base.variants import choose_variant
 from mi_nerf.cli import main
 from mi_nerf.data import load_dataset
 from mi_nerf.generation import PROTOCOLS, Options, generate
+from mi_nerf.generation.run import prepare
 from mi_nerf.plugins.placement import find_fields
 from mi_nerf.scene_xml.library import find_scene, scene_folder, scenes
 from mi_nerf.scene_xml.scene_file import SceneFile, visible_bounds
@@ -25,11 +27,13 @@ FOLDER = scene_folder()
 ASSETS = FOLDER / "assets"
 COMPOSED = sorted(path.stem for path in (FOLDER / "composed").glob("*.xml"))
 NAMES = sorted(set(scenes()) - set(COMPOSED))
-GROUPS = {"realistic": 8, "diffuse": 4, "forward": 2, "hard": 4}
+GROUPS = {"realistic": 8, "diffuse": 4, "forward": 2, "unbounded": 2, "hard": 4}
+UNBOUNDED = sorted(path.stem for path in (FOLDER / "unbounded").glob("*.xml"))
 # Mean alpha and mean luminance, of pixels up to 1, of 24x18 pixels with 256 samples each.
 LOOKS = {
     **{"arches": (0.387, 0.128), "birdcage": (0.285, 0.074), "blob": (0.097, 0.073)},
     **{"bonsai": (0.318, 0.050), "cathedral": (0.313, 0.166), "corner": (1.0, 0.379)},
+    **{"courtyard": (1.0, 0.278), "studio": (1.0, 0.208)},
     **{"decanter": (0.265, 0.065), "fog": (0.387, 0.117), "globe": (0.366, 0.134)},
     **{"hdr": (0.249, 0.035), "kettle": (0.347, 0.099), "knot": (0.349, 0.093)},
     **{"lamp": (0.337, 0.129), "pieces": (0.327, 0.088), "puzzleball": (0.361, 0.145)},
@@ -64,11 +68,14 @@ def test_every_scene(name: str) -> None:
     protocol = file.default("protocol")
     assert protocol in PROTOCOLS
     box = visible_bounds(scene)
-    assert box is not None and np.abs(np.array(box)).max() <= 1.0001
+    assert box is not None
+    reach = np.abs(np.array(box)).max()
+    assert reach > 20 if name in UNBOUNDED else reach <= 1.0001
     image = np.array(mi.render(scene, seed=1, spp=16))
     assert image[..., :3].min() >= 0
     alpha, luminance = image[..., 3], image[..., :3] @ [0.2126, 0.7152, 0.0722]
-    assert (alpha == 1).all() if protocol == "forward" else (alpha == 0).any()
+    full = protocol == "forward" or name in UNBOUNDED
+    assert (alpha == 1).all() if full else (alpha == 0).any()
     assert alpha.mean() == pytest.approx(LOOKS[name][0], abs=0.02)
     assert np.minimum(luminance, 1).mean() == pytest.approx(LOOKS[name][1], rel=0.2)
 
@@ -137,7 +144,7 @@ def test_nothing_meets_the_end_of_the_last_curve(file: str) -> None:
 
 def test_assets_are_small() -> None:
     total = sum(p.stat().st_size for p in ASSETS.iterdir() if p.suffix != ".py")
-    assert total < 1.2e6
+    assert total < 3.4e6
 
 
 def test_no_asset_lies_idle() -> None:
@@ -170,7 +177,7 @@ def same_content(made: Path, kept: Path) -> None:
         close = np.array(a.bbox().max) == pytest.approx(np.array(b.bbox().max), abs=1e-4)
         assert close
         return
-    if made.suffix == ".png":
+    if made.suffix in (".png", ".jpg"):
         import imageio.v3 as iio
 
         a, b = (iio.imread(p).astype(float) for p in (made, kept))
@@ -238,3 +245,61 @@ def test_hdr_spans_four_decades(tmp_path: Path) -> None:
     seen = image[..., 3] > 0.99
     luminance = image[..., :3][seen] @ [0.2126, 0.7152, 0.0722]
     assert luminance.max() > 1e4 * np.quantile(luminance, 0.1)
+
+
+# ---- Scenes without an end ---------------------------------------------------
+
+
+def distances(scene: Any, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """How far along rays something is; infinite where nothing is."""
+    ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(directions.T))
+    return np.array(scene.ray_intersect_preliminary(ray).t)
+
+
+def everywhere(count: int) -> np.ndarray:
+    """Unit vectors that are spread over the sphere, (count, 3)."""
+    z = 1 - 2 * (np.arange(count) + 0.5) / count
+    angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
+    level = np.sqrt(1 - z * z)
+    return np.stack([level * np.cos(angle), level * np.sin(angle), z], 1)
+
+
+@pytest.mark.slow
+def test_cameras_of_the_courtyard_stand_in_the_court() -> None:
+    """Clear of everything, with the object before them, hills behind it, and some sky."""
+    mi.set_variant(VARIANT)
+    file = SceneFile(find_scene("courtyard"))
+    _, plan = prepare(file, Options(train=24, val=0, test=0, size=(32, 32), spp=2))
+    scene = SceneFile(find_scene("courtyard")).load()
+    places = np.array([view.pose[:3, 3] for view in plan.views])
+    center = np.array(plan.center)
+    assert np.linalg.norm(places - center, axis=1) == pytest.approx(plan.radius)
+    assert (np.abs(places[:, :2]) < 6).all() and (places[:, 2] > 1.4).all()
+    assert (places[:, 2] < 4.5).all()
+    around = everywhere(256)
+    for place in places:
+        assert distances(scene, np.tile(place, (256, 1)), around).min() > 0.5
+    # From the centre to the cameras nothing but the object itself is in the way.
+    inwards = (center - places) / plan.radius
+    beyond = distances(scene, places, inwards)
+    assert (beyond > plan.radius - 1.6).all()
+    seen = np.concatenate([distances(scene, np.tile(p, (256, 1)), around) for p in places])
+    assert (seen > 100).mean() > 0.02 and np.isinf(seen).mean() > 0.2
+    assert np.quantile(seen[np.isfinite(seen)], 0.5) < 10
+    assert plan.subject.names and all(name.startswith("fountain") for name in plan.subject.names)
+
+
+@pytest.mark.slow
+def test_the_studio_is_closed_but_for_its_window() -> None:
+    mi.set_variant(VARIANT)
+    scene = SceneFile(find_scene("studio")).load()
+    around = everywhere(4096)
+    for place in ((0.3, -0.3, 1.5), (-1.5, -0.5, 1.2), (2.0, 0.8, 1.7)):
+        found = distances(scene, np.tile(place, (4096, 1)), around)
+        outside = np.array(place) + np.minimum(found, 100)[:, None] * around
+        escaped = (np.abs(outside) > [3.21, 2.61, 3.3]).any(axis=1)
+        out = around[escaped]
+        assert 0.02 < escaped.mean() < 0.2 and (out[:, 1] > 0).all()
+        through = np.array(place) + out * ((2.6 - place[1]) / out[:, 1])[:, None]
+        assert (through >= [-2.01, 0, 0.81]).all() and (through <= [1.41, 3, 2.76]).all()
+        assert np.isinf(found).any() and found[np.isfinite(found)].max() > 10

@@ -1,0 +1,176 @@
+"""From a user's wishes and a scene to a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..base.errors import InputError, Option
+from ..scene_xml.parts import Part, read_parts
+from ..scene_xml.scene_file import Bounds, SceneFile
+from ..scene_xml.sensors import named_ups
+from .choosing import Choice, Situation, choose, protocol_name
+from .plan import Plan, halves
+from .protocol import Options
+from .sensors import SensorCamera, read_sensors
+from .subject import Subject, find_subject, told_subject
+from .upright import told_up, vertical
+
+__all__ = ["make_plan", "protocol_name"]
+
+Array = np.ndarray[Any, Any]
+
+_DEFAULT_SPP = 128  # of scenes whose sensor has no sampler
+_THIN = 1e-3  # of its largest extent a box has at least in each direction: readers want a volume
+_MARGIN = 0.05  # around what is seen of a room
+
+
+def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Plan:
+    """Decides everything that the user left open.
+
+    Args:
+        scene: ``file``, loaded.
+        box: Of the visible shapes of ``scene``.
+
+    Raises:
+        InputError: for options that make no sense, alone or for this scene.
+    """
+    protocol_name(file, options)  # is known
+    spp = _samples(file, scene, options)
+    sensors = read_sensors(scene) if file.plugins("Sensor") else []
+    parts = read_parts(file)
+    box = _with_merged(box, parts)
+    if options.up is None:
+        up, why = vertical(sensors, named_ups(file), parts)
+    else:
+        up, why = told_up(options.up), "what was told"
+    subject = _subject(parts, box, sensors, options)
+    choice = choose(Situation(file, scene, box, up, sensors, subject, options))
+    return Plan(
+        protocol=choice.protocol,
+        cameras=choice.shots.cameras,
+        intrinsics=choice.shots.intrinsics,
+        spp=spp,
+        seed=options.seed,
+        views=choice.shots.views,
+        box=box,
+        region=_region(box, choice),
+        up=_triple(up),
+        center=_triple(choice.shots.center),
+        radius=choice.shots.radius,
+        elevation=options.elevation,
+        hide_emitters=choice.survey.hide_emitters,
+        subject=choice.subject,
+        survey=choice.survey,
+        notes=(
+            f"up is taken from {why}",
+            *filter(None, [str(choice.subject)]),
+            *choice.notes,
+            *_about_sensors(sensors, choice),
+            str(choice.survey),
+        ),
+    )
+
+
+def _with_merged(box: Bounds, parts: Sequence[Part]) -> Bounds:
+    """The box of all that is visible: Mitsuba forgets that of rectangles merged with meshes."""
+    visible = [part for part in parts if not part.glows]
+    lower = np.min([np.array(box[0]), *(part.lower for part in visible)], axis=0)
+    upper = np.max([np.array(box[1]), *(part.upper for part in visible)], axis=0)
+    return _triple(lower), _triple(upper)
+
+
+def _subject(
+    parts: Sequence[Part], box: Bounds, sensors: Sequence[SensorCamera], options: Options
+) -> Subject:
+    """What the cameras look at."""
+    if options.object is not None:
+        return told_subject(parts, options.object)
+    cameras = [sensor for sensor in sensors if sensor.kind is None]
+    return find_subject(parts, box, cameras[0] if cameras else None)
+
+
+def _region(box: Bounds, choice: Choice) -> Bounds:
+    """The box of what a field should hold: the scene, or its part near the cameras."""
+    lower, upper = np.array(box)
+    shots = choice.shots
+    if shots.cameras == "room":
+        ends = np.quantile(choice.survey.points, [0.001, 0.999], axis=0)
+        margin = _MARGIN * float(np.ptp(ends, axis=0).max())
+        lower, upper = ends[0] - margin, ends[1] + margin
+    elif shots.cameras in ("hemisphere", "sphere") and not choice.subject.is_all:
+        lower = np.maximum(lower, shots.center - shots.radius)
+        upper = np.minimum(upper, shots.center + shots.radius)
+    least = _THIN * float((upper - lower).max())
+    pad = np.where(upper - lower < least, least, 0.0)
+    return _triple(lower - pad), _triple(upper + pad)
+
+
+def _about_sensors(sensors: Sequence[SensorCamera], choice: Choice) -> list[str]:
+    """What of the scene's sensors is not used, or not as the scene has it."""
+    taken = choice.shots.cameras == "scene"
+    notes = []
+    if taken:
+        lost = [f"{s.name} ({s.kind})" for s in sensors if s.kind is not None]
+        if lost:
+            notes.append(f"not taken, as no cameras of a dataset: {', '.join(lost)}")
+    elif len(sensors) > 1:
+        notes.append(
+            f"{len(sensors) - 1} of the scene's {len(sensors)} sensors are not used: "
+            "--cameras scene takes them all"
+        )
+    here = [s for s in sensors if s.kind is None] if taken else sensors[:1]
+    mirrored = [s.name for s in here if s.mirrored]
+    if mirrored and (taken or choice.shots.cameras == "forward"):
+        notes.append(f"mirrored: {', '.join(mirrored)}; pictures are not, x is turned round")
+    notes += _about(
+        "lens", [s for s in here if s.lens], taken, "transforms hold the pinhole in its centre"
+    )
+    notes += _about(
+        "crop window", [s for s in here if s.cropped], taken, "pictures are the window alone"
+    )
+    return notes
+
+
+def _about(what: str, having: Sequence[SensorCamera], taken: bool, how: str) -> list[str]:
+    if not having:
+        return []
+    if taken:
+        return [f"{what}: {', '.join(s.name for s in having)}; {how}"]
+    return [f"the {what} of {having[0].name} is not used: --cameras scene takes it"]
+
+
+# ---- Numbers -----------------------------------------------------------------
+
+
+def _samples(file: SceneFile, scene: Any, options: Options) -> int:
+    """Samples a pixel."""
+    spp = options.spp
+    if spp is None:
+        sensor = scene.sensors()[0] if file.plugins("Sensor") else None
+        spp = _sampler_spp(sensor) if file.plugins("Sampler") else _DEFAULT_SPP
+    if spp < 2:
+        raise InputError(
+            "{}: expected at least 2, of which the noise is estimated", Option("spp", spp)
+        )
+    return spp
+
+
+def _sampler_spp(sensor: Any) -> int:
+    """The samples of a sensor's sampler, or some more where it cannot take half of them."""
+    if sensor is None:
+        return _DEFAULT_SPP
+    sampler = sensor.sampler()
+    spp = int(sampler.sample_count())
+    for half in halves(spp):
+        sampler.set_sample_count(half)
+        if half > 0 and sampler.sample_count() != half:
+            return 2 * int(sampler.sample_count())
+    return spp
+
+
+def _triple(values: Array) -> tuple[float, float, float]:
+    x, y, z = np.asarray(values, np.float64).tolist()
+    return x, y, z
