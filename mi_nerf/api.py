@@ -52,6 +52,7 @@ def generate(
     up: Literal["x", "y", "z"] | None = None,
     center: tuple[float, float, float] | None = None,
     radius: float | None = None,
+    keep_emitters: Sequence[str] = (),
     parameters: Mapping[str, str] | None = None,
     resume: bool = False,
     variant: str | None = None,
@@ -68,6 +69,7 @@ def generate(
         spp: samples a pixel; default: those of the scene's sampler.
         seed: of camera positions and of the noise.
         cameras, up, center, radius: where 360-degree cameras stand, in scene units.
+        keep_emitters: IDs of light sources that 360-degree cameras see, or ``["all"]``.
         parameters: values of the scene's ``$parameters``.
         show: say what is made, and how far it is.
 
@@ -95,6 +97,7 @@ def generate(
         up=up,
         center=center,
         radius=radius,
+        keep_emitters=tuple(keep_emitters),
     )
     path = find_scene(str(scene))
     return generation.generate(

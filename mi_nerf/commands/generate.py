@@ -58,6 +58,8 @@ class Generate:
     """What cameras look at; default: the origin, or the middle of scenes beyond [-1, 1]^3."""
     radius: float | None = None
     """Distance from it (forward: how far cameras move); default: 4, or as the scene's size says."""
+    keep_emitters: tuple[str, ...] = ()
+    """IDs of light sources that are part of the object and seen, or all; default: none is seen."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Values of the scene's $parameters: name=value; repeatable."""
     variant: Variant = None

@@ -61,6 +61,7 @@ class Plan:
     up: tuple[float, float, float]
     center: tuple[float, float, float]  # what the cameras look at; forward: where they are
     radius: float  # their distance from it; forward: how far they move from it
+    keep_emitters: tuple[str, ...] = ()  # light sources that are seen all the same
 
     @property
     def halves(self) -> tuple[int, int]:
@@ -114,6 +115,7 @@ class Plan:
             "up": list(self.up),
             "center": list(self.center),
             "radius": self.radius,
+            **({"keep_emitters": list(self.keep_emitters)} if self.keep_emitters else {}),
         }
 
 
@@ -162,6 +164,7 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
         up=_triple(up),
         center=_triple(shots.center),
         radius=shots.radius,
+        keep_emitters=options.keep_emitters,
     )
 
 

@@ -46,3 +46,4 @@ class Options:
     up: Literal["x", "y", "z"] | None = None  # vertical axis; that of the scene's sensor, or z
     center: tuple[float, float, float] | None = None  # what the cameras look at
     radius: float | None = None  # their distance from it; forward: how far they move sideways
+    keep_emitters: tuple[str, ...] = ()  # IDs of light sources that are seen, or "all"

@@ -19,6 +19,9 @@ from ..base.machine import versions
 from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
 from ..scene_xml.scene_file import SceneFile, visible_bounds
+from .emitters import ALL, Hidden
+from .integrators import color_integrator, is_adjoint, require_choice
+from .notes import memory_line, notes
 from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View, make_plan, protocol_name
 from .protocol import SPLITS, Options
@@ -68,11 +71,12 @@ def generate(
         with _quiet():
             file = SceneFile(scene, parameters)
             tracer, plan = prepare(file, options or Options())
+            told = [*notes(plan), memory_line(plan, tracer.samples_at_once)]
         record = json.loads(json.dumps(_describe(file, plan, variant)))  # as it will be read
         if resume and (folder / RECORD).exists():
             record["views"] = _resumed_views(folder, record, plan)
         if show:
-            print(plan, flush=True)
+            print(plan, *told, sep="\n", flush=True)
         return _trace_views(folder, tracer, plan, record, show)
 
 
@@ -129,25 +133,41 @@ def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
     import mitsuba as mi
 
     hide = protocol_name(file, options) != "forward"
+    if options.keep_emitters and not hide:
+        raise InputError(
+            "{}: has no meaning for the protocol 'forward', which shows all",
+            Option("keep_emitters", " ".join(options.keep_emitters)),
+        )
     integrators = file.plugins("Integrator")
-    if hide:
-        for properties in integrators:
-            properties["hide_emitters"] = True
+    for properties in integrators:
+        if hide:
+            properties["hide_emitters"] = ALL not in options.keep_emitters
+        if "samples_per_pass" in properties:  # which would have to divide every pass of ours
+            del properties["samples_per_pass"]
     scene = file.load()
     media = (shape.interior_medium() for shape in scene.shapes())
     if not scene.emitters() and not any(hasattr(medium, "field") for medium in media):
         raise InputError(f"{file.path}: has no emitter, all images would be black")
-    box = visible_bounds(scene)
+    hidden = Hidden(scene, hide, options.keep_emitters)
+    box = visible_bounds(scene, hidden.keeps)
     if box is None or not np.ptp(np.array(box), axis=0).any():
+        if hidden.any and visible_bounds(scene, lambda shape: True) is not None:
+            raise InputError(
+                "{}: all its shapes are light sources, which cameras do not see, expected {}",
+                file.path,
+                Option("keep_emitters", ALL),
+            )
         raise InputError(f"{file.path}: its box is empty, expected shapes that can be seen")
     plan = make_plan(file, scene, box, options)
-    integrator = scene.integrator()
-    if not integrators:
-        integrator = mi.load_dict({"type": "path", "hide_emitters": hide})
+    integrator = scene.integrator() if integrators else mi.load_dict({"type": "path"})
+    integrator = color_integrator(integrator, file.path)
+    require_choice(integrator, hidden, file.path)
+    if (not integrators or hidden.chosen) and not is_adjoint(integrator):
+        integrator.hide_emitters = hidden.any and not hidden.partly
     has_sampler = bool(file.plugins("Sampler")) and bool(file.plugins("Sensor"))
     sampler = scene.sensors()[0].sampler() if has_sampler else mi.load_dict({"type": "independent"})
     _check_sampler(sampler, plan)
-    return Tracer(scene, integrator, sampler, plan), plan
+    return Tracer(scene, integrator, sampler, plan, hidden), plan
 
 
 def _check_sampler(sampler: Any, plan: Plan) -> None:
