@@ -87,16 +87,14 @@ def _check(kept: set[str], emitters: list[Any]) -> None:
     """Refuses IDs of what is no light source, or none that can be seen."""
     seen = [e for e in emitters if e.get_shape() is not None or e.is_environment()]
     known = set().union(*(_names(e) for e in seen)) | {ALL}
+    names = ", ".join(map(_best_name, seen))
     for name in sorted(kept - known):
+        known_otherwise = any(name in _names(e) for e in emitters)
         raise InputError(
             "{}: {}, expected {}",
             Option("keep_emitters", name),
-            "cannot be seen, it is no surface"
-            if any(name in _names(e) for e in emitters)
-            else "no light source of the scene",
-            " or ".join([ALL, ", ".join(map(_best_name, seen))])
-            if seen
-            else "none: all are unseen",
+            "cannot be seen, it is no surface" if known_otherwise else "no light source",
+            f"{ALL} or {names}" if seen else "none, no light source can be seen",
         )
 
 

@@ -149,7 +149,7 @@ def _first_nested(integrator: Any) -> Any:
 
     found: list[Any] = []
 
-    class Finder(mi.TraversalCallback):  # type: ignore[misc]
+    class Finder(mi.TraversalCallback):
         def put(self, name: str, value: Any, *_: Any) -> None:
             if isinstance(value, mi.Integrator):
                 found.append(value)

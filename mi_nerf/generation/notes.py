@@ -20,7 +20,7 @@ def notes(plan: Plan) -> list[str]:
     """One line for each limit of single precision that a scene comes near."""
     box = np.array(plan.box)
     size = float(np.linalg.norm(box[1] - box[0]))
-    reach = float(np.abs(box).max()) + plan.radius
+    reach = float(np.abs(box).max())
     spacing = float(np.spacing(np.float32(reach)))
     found = []
     if spacing > _COARSE * size:

@@ -10,13 +10,13 @@ import numpy as np
 
 from ..base.arrays import Image
 from ..base.errors import InputError
-from ..cameras.pinhole import Intrinsics, sensor_dict
-from ..cameras.poses import mitsuba_from_opengl
+from ..cameras.pinhole import Intrinsics
 from . import invalid
+from .camera import Camera
 from .emitters import Hidden
 from .integrators import is_adjoint, kind, needs_help_hiding, needs_own_alpha, samples_rays
 from .noise import Samples
-from .passes import Tile, fits, passes, tiles
+from .passes import Tile, fits, passes, sets, tiles
 from .plan import Plan, View
 from .surfaces import trace_surfaces
 from .wrapped import choosing, coverage_integrator, guarded
@@ -67,13 +67,14 @@ class Tracer:
         self._in_passes = adjoint or sampler.class_name() == "IndependentSampler"
         self._sampler = sampler
         self._guarded: Any = None
-        self._cameras: dict[tuple[int, int, bool], _Camera] = {}
+        self._cameras: dict[tuple[int, int, bool], Camera] = {}
 
     @property
     def samples_at_once(self) -> int:
-        """Paths that are traced at a time, at most."""
-        part = self._parts(max(self._plan.halves))[0]
-        pixels = self._plan.pixels if part.tile is None else part.tile.pixels
+        """Paths that are traced at a time, of the first view."""
+        view = self._plan.views[0]
+        part = self._parts(view, max(self._plan.halves))[0]
+        pixels = self._pixels(view) if part.tile is None else part.tile.pixels
         return part.samples * pixels
 
     def trace(self, view: View) -> TracedView:
@@ -82,63 +83,67 @@ class Tracer:
         Raises:
             InputError: if too many samples are NaN or infinite.
         """
-        (a, b), (count_a, count_b) = zip(
-            *(self._half(view, half, n) for half, n in enumerate(self._plan.halves)), strict=True
-        )
-        dropped = self._plan.spp * self._plan.pixels - self._taken(count_a) - self._taken(count_b)
-        share = dropped / (self._plan.spp * self._plan.pixels)
+        a, b = (self._half(view, half, n) for half, n in enumerate(self._plan.halves))
+        dropped = a.dropped + b.dropped
+        share = dropped / (self._plan.spp * self._pixels(view))
         if share > invalid.SHARE:
             raise InputError(
                 f"view {view.name}: {share:.1%} of its samples are NaN or infinite, "
                 f"expected at most {invalid.SHARE:.0%}"
             )
         depth, normal = trace_surfaces(
-            self._scene, self._plan.intrinsics, view.pose, hide_emitters=self._hidden
+            self._scene, self._intrinsics(view), view.pose, hide_emitters=self._hidden
         )
-        return TracedView((a, b), (count_a, count_b), dropped, depth, normal)
+        return TracedView((a.image, b.image), (a.samples, b.samples), dropped, depth, normal)
 
-    def _taken(self, samples: Samples) -> int:
-        """How many samples a picture is made of."""
-        if isinstance(samples, int):
-            return samples * self._plan.pixels
-        return int(samples.sum(dtype=np.float64))
+    def _intrinsics(self, view: View) -> Intrinsics:
+        return self._plan.intrinsics
 
-    def _parts(self, samples: int) -> list[_Part]:
+    def _pixels(self, view: View) -> int:
+        return self._intrinsics(view).width * self._intrinsics(view).height
+
+    def _parts(self, view: View, samples: int) -> list[_Part]:
         """What is traced at a time of a picture of so many samples a pixel."""
+        pixels = self._pixels(view)
         if self._in_passes:
-            return [_Part(n) for n in passes(samples, self._plan.pixels)]
-        if fits(samples, self._plan.pixels):
+            return [_Part(n) for n in passes(samples, pixels)]
+        if fits(samples, pixels):
             return [_Part(samples)]
-        return [_Part(samples, tile) for tile in tiles(self._plan.intrinsics, samples)]
+        if self._camera(view, None).can_shift:
+            return [_Part(samples, tile) for tile in tiles(self._intrinsics(view), samples)]
+        return [_Part(n) for n in sets(samples, pixels, self._sampler)]
 
-    def _half(self, view: View, half: int, samples: int) -> tuple[Image, Samples]:
-        """One of the two independent images of a view, and of how many samples a pixel it is."""
-        parts = self._parts(samples)
+    def _half(self, view: View, half: int, samples: int) -> _Half:
+        """One of the two independent images of a view."""
+        parts = self._parts(view, samples)
         drawn = (self._part(view, part, view.render_seed(half, i)) for i, part in enumerate(parts))
         if parts[0].tile is not None:
-            return self._joined(parts, drawn, samples)
+            return self._joined(view, parts, drawn)
         total: Any = 0.0
         taken: Any = 0
         for image, good in drawn:
             total = total + image * np.float32(good)
             taken = taken + good
-        if not isinstance(taken, int):
-            taken = taken.astype(np.float32)
-            return (total / np.maximum(taken, 1)).astype(np.float32), taken
-        return total / np.float32(samples), taken
+        if isinstance(taken, int):
+            return _Half(total / np.float32(taken), taken, 0)
+        taken = taken.astype(np.float32)
+        dropped = sum(part.samples for part in parts) * self._pixels(view) - _sum(taken)
+        return _Half((total / np.maximum(taken, 1)).astype(np.float32), taken, dropped)
 
     def _joined(
-        self, parts: list[_Part], drawn: Iterable[tuple[Image, Samples]], samples: int
-    ) -> tuple[Image, Samples]:
+        self, view: View, parts: list[_Part], drawn: Iterable[tuple[Image, Samples]]
+    ) -> _Half:
         """A picture of its tiles."""
-        size = self._plan.intrinsics.height, self._plan.intrinsics.width
+        size = self._intrinsics(view).height, self._intrinsics(view).width
         image = np.zeros((*size, 4), np.float32)
-        taken = np.full((*size, 1), samples, np.float32)
+        taken = np.zeros((*size, 1), np.float32)
         for part, (piece, good) in zip(parts, drawn, strict=True):
             assert part.tile is not None
             image[part.tile.place] = piece
             taken[part.tile.place] = good
-        return image, samples if (taken == samples).all() else taken
+        samples = parts[0].samples
+        dropped = samples * self._pixels(view) - _sum(taken)
+        return _Half(image, taken if dropped else samples, dropped)
 
     def _part(self, view: View, part: _Part, seed: int) -> tuple[Image, Samples]:
         """Linear premultiplied RGBA of a part, and of how many samples a pixel it is."""
@@ -149,7 +154,7 @@ class Tracer:
             image[..., 3] = self._render(camera, self._coverage, part.samples, seed)[..., 4]
         return image, good
 
-    def _color(self, camera: _Camera, spp: int, seed: int) -> tuple[Image, Samples]:
+    def _color(self, camera: Camera, spp: int, seed: int) -> tuple[Image, Samples]:
         if self._guarded is None:
             image = self._render(camera, self._integrator, spp, seed)
             if image.shape[-1] != self._channels:
@@ -169,7 +174,7 @@ class Tracer:
             return image[..., :4], spp
         return invalid.without_invalid(image, spp)
 
-    def _one_by_one(self, camera: _Camera, spp: int, seed: int) -> tuple[Image, Samples]:
+    def _one_by_one(self, camera: Camera, spp: int, seed: int) -> tuple[Image, Samples]:
         """From pictures of one sample a pixel each."""
         seeds = np.random.SeedSequence(seed).generate_state(spp, np.uint32)
         plain = camera.with_sampler(_independent())
@@ -177,17 +182,17 @@ class Tracer:
             lambda i: self._render(plain, self._integrator, 1, int(seeds[i])), spp
         )
 
-    def _camera(self, view: View, tile: Tile | None) -> _Camera:
+    def _camera(self, view: View, tile: Tile | None) -> Camera:
         """The camera of a view, or of a tile of it; one for all of a size."""
-        intrinsics = self._plan.intrinsics if tile is None else tile.intrinsics
+        intrinsics = self._intrinsics(view) if tile is None else tile.intrinsics
         size = intrinsics.width, intrinsics.height, tile is not None
         if size not in self._cameras:
-            self._cameras[size] = _Camera(intrinsics, self._plan.scale, self._sampler)
+            self._cameras[size] = Camera(intrinsics, self._plan.scale, self._sampler)
         camera = self._cameras[size]
         camera.move(view.pose, None if tile is None else intrinsics)
         return camera
 
-    def _render(self, camera: _Camera, integrator: Any, spp: int, seed: int) -> Image:
+    def _render(self, camera: Camera, integrator: Any, spp: int, seed: int) -> Image:
         import mitsuba as mi
 
         try:
@@ -213,39 +218,17 @@ class _Part:
     tile: Tile | None = None  # where; None: the whole picture
 
 
-class _Camera:
-    """A sensor that moves."""
+@dataclass(frozen=True)
+class _Half:
+    """One of the two images of a view."""
 
-    def __init__(self, intrinsics: Intrinsics, scale: float, sampler: Any) -> None:
-        import mitsuba as mi
+    image: Image
+    samples: Samples  # a pixel, without those that were dropped
+    dropped: int  # in all
 
-        self._intrinsics, self._scale = intrinsics, scale
-        description = sensor_dict(
-            intrinsics, np.eye(4), near_clip=1e-3 * scale, far_clip=1e3 * scale
-        )
-        self.sensor = mi.load_dict({**description, "sampler": sampler})
-        self._parameters = mi.traverse(self.sensor)
-        self._pose: Any = None
 
-    def move(self, pose: Image, intrinsics: Intrinsics | None = None) -> None:
-        """Moves the camera, and with ``intrinsics``, of the same size, its principal point."""
-        import mitsuba as mi
-
-        self._pose = pose
-        to_world = mi.ScalarTransform4f(mitsuba_from_opengl(pose).tolist())
-        self._parameters["to_world"] = mi.Transform4f(to_world)
-        if intrinsics is not None:
-            self._intrinsics = intrinsics
-            x, y = intrinsics.principal_point_offset
-            self._parameters["principal_point_offset_x"] = x
-            self._parameters["principal_point_offset_y"] = y
-        self._parameters.update()
-
-    def with_sampler(self, sampler: Any) -> _Camera:
-        """The same camera with another sampler."""
-        other = _Camera(self._intrinsics, self._scale, sampler)
-        other.move(self._pose)
-        return other
+def _sum(counts: Image) -> int:
+    return int(counts.sum(dtype=np.float64))
 
 
 def _independent() -> Any:

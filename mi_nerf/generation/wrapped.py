@@ -27,7 +27,7 @@ def coverage_integrator(hidden: Hidden) -> Any:
     """
     import mitsuba as mi
 
-    class Coverage(mi.SamplingIntegrator):  # type: ignore[misc]
+    class Coverage(mi.SamplingIntegrator):
         """What covers the camera's rays."""
 
         def sample(
@@ -50,7 +50,7 @@ def choosing(integrator: Any, hidden: Hidden) -> Any:
     """
     import mitsuba as mi
 
-    class Choosing(mi.SamplingIntegrator):  # type: ignore[misc]
+    class Choosing(mi.SamplingIntegrator):
         """Begins behind hidden light sources, and hides what surrounds the scene."""
 
         def sample(
@@ -79,7 +79,7 @@ def guarded(integrator: Any) -> Any:
     """
     import mitsuba as mi
 
-    class Guarded(mi.SamplingIntegrator):  # type: ignore[misc]
+    class Guarded(mi.SamplingIntegrator):
         """Drops samples that are no numbers."""
 
         def sample(

@@ -89,8 +89,8 @@ def test_which_rays_meet_them() -> None:
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("lamp", "no light source of the scene, expected all or "),
-        ("ball", "no light source of the scene, expected all or "),
+        ("lamp", "no light source, expected all or "),
+        ("ball", "no light source, expected all or "),
         ("spark", "cannot be seen, it is no surface, expected all or "),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 
 from mi_nerf.base.errors import InputError
 from mi_nerf.base.variants import choose_variant
+from mi_nerf.data import load_dataset
 from mi_nerf.generation import Options, generate
 from mi_nerf.generation import passes as passes_module
 from mi_nerf.generation.run import prepare
@@ -92,10 +94,6 @@ def coverage_of(record: dict[str, Any], pose: np.ndarray, lamp: bool) -> np.ndar
 
 def made(folder: Path, scene: Path, **more: Any) -> tuple[dict[str, Any], np.ndarray, np.ndarray]:
     """The record, the picture, and its camera."""
-    from dataclasses import replace
-
-    from mi_nerf.data import load_dataset
-
     record = generate(scene, folder, VARIANT, replace(OPTIONS, **more), show=False)
     pose = load_dataset(folder, "train").cam_to_world[0]
     return record, exr(folder / "train/r_0.exr"), pose
@@ -163,8 +161,6 @@ def test_one_lamp_and_no_other(tmp_path: Path, name: str) -> None:
     )
     scene.write_text(text)
     mi.set_variant(VARIANT)
-    from dataclasses import replace
-
     options = replace(OPTIONS, keep_emitters=("bulb",))
     with pytest.raises(InputError, match="can show all light sources or none, expected keep_emi"):
         prepare(SceneFile(scene), options)
@@ -184,7 +180,7 @@ def test_passes_of_every_sampler(
     limit = 48 * 40 * 5 + 7
     monkeypatch.setattr(passes_module, "SAMPLES_PER_PASS", limit)
     parts, pieces, _ = made(tmp_path / "parts", scene, spp=None)
-    tracer, plan = prepare(SceneFile(scene), OPTIONS)
+    tracer, _ = prepare(SceneFile(scene), replace(OPTIONS, spp=None))
     assert tracer.samples_at_once <= limit
     assert parts["settings"] == whole["settings"]
     told = [r["views"]["train/r_0"]["noise"]["mse_linear"] for r in (whole, parts)]
