@@ -54,6 +54,7 @@ def generate(
     radius: float | None = None,
     elevation: tuple[float, float] | None = None,
     object: str | Sequence[str] | None = None,
+    keep_emitters: Sequence[str] = (),
     parameters: Mapping[str, str] | None = None,
     resume: bool = False,
     plan: bool = False,
@@ -76,6 +77,7 @@ def generate(
         up: vertical axis, ``"y"`` or ``"-z"``, or direction; default: as the scene's sensor or
             its base shows.
         object: ids of the shapes that cameras look at; default: all but what surrounds them.
+        keep_emitters: IDs of light sources that 360-degree cameras see, or ``["all"]``.
         parameters: values of the scene's ``$parameters``.
         plan: only draw where the cameras would stand: ``cameras.png`` in ``out``, or ``out``
             itself where it is the name of a picture. Nothing is rendered.
@@ -108,6 +110,7 @@ def generate(
         radius=radius,
         elevation=elevation,
         object=(object,) if isinstance(object, str) else tuple(object or ()) or None,
+        keep_emitters=tuple(keep_emitters),
     )
     path = find_scene(str(scene))
     if plan:

@@ -69,6 +69,8 @@ class Generate:
     """Lowest and highest angle of 360-degree cameras over its horizon, degrees; default: all."""
     plan: bool = False
     """Only draw the cameras: OUT/cameras.png, or OUT if it ends so; renders nothing."""
+    keep_emitters: tuple[str, ...] = ()
+    """IDs of light sources that are part of the object and seen, or all; default: none is seen."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Values of the scene's $parameters: name=value; repeatable."""
     variant: Variant = None

@@ -20,7 +20,7 @@ from ..base.checks import valid_size
 from ..base.errors import InputError, Option
 from ..scene_xml.scene_file import Bounds, SceneFile
 from . import shots
-from .probes import blocked
+from .probes import Hides, blocked
 from .protocol import HOLD_OUT, PROTOCOLS, SPLITS, Options
 from .rooms import is_enclosed
 from .sensors import SensorCamera
@@ -45,6 +45,7 @@ class Situation:
     sensors: Sequence[SensorCamera]
     subject: Subject
     options: Options
+    hidden: Hides = True  # light sources that cameras around the object do not see
 
     @property
     def sensor(self) -> SensorCamera | None:
@@ -97,7 +98,7 @@ def _of_sensors(name: str, here: Situation) -> Choice:
     cameras = [sensor for sensor in here.sensors if sensor.kind is None]
     chosen = shots.of_sensors(cameras, here.options.size, here.options, here.file.path)
     hide = name not in ("forward", "room") and not _stands_enclosed(here, cameras[0])
-    return _surveyed(name, here, chosen, here.subject, hide=hide)
+    return _surveyed(name, here, chosen, here.subject, hide=here.hidden if hide else False)
 
 
 def _inside(here: Situation, *notes: str) -> Choice:
@@ -109,9 +110,9 @@ def _inside(here: Situation, *notes: str) -> Choice:
 
 def _around(name: str, here: Situation, size: tuple[int, int], counts: dict[str, int]) -> Choice:
     """Cameras around the object, or inside if the scene is a room and nobody asked for others."""
-    seeing = None if here.subject.is_all else partial(sees, here.scene, here.subject)
+    seeing = None if here.subject.is_all else partial(sees, here.scene, here.subject, here.hidden)
     chosen = shots.around(here.file, here.subject.box, here.up, size, counts, here.options, seeing)
-    found = _surveyed(name, here, chosen, here.subject, hide=True)
+    found = _surveyed(name, here, chosen, here.subject, hide=here.hidden)
     reason = _why_room(here, found)
     if reason is None:
         return found
@@ -127,11 +128,11 @@ def _around(name: str, here: Situation, size: tuple[int, int], counts: dict[str,
         )
     seen = percent(found.survey.coverage)
     warning = f"warning: {reason}; {seen} of the pixels see the object"
-    return _surveyed(name, here, chosen, here.subject, warning, hide=True)
+    return _surveyed(name, here, chosen, here.subject, warning, hide=here.hidden)
 
 
 def _surveyed(
-    name: str, here: Situation, chosen: Shots, subject: Subject, *notes: str, hide: bool
+    name: str, here: Situation, chosen: Shots, subject: Subject, *notes: str, hide: Hides
 ) -> Choice:
     """The choice, with what the training cameras see of the object."""
     poses, intrinsics = chosen.of([view for view in chosen.views if view.split == "train"])

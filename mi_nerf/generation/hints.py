@@ -18,8 +18,9 @@ def with_hints(file: SceneFile, options: Options) -> Options:
 
     ``cameras_object`` names the object's shapes, ``cameras_center`` and ``cameras_radius`` say
     what the cameras look at and from how far, ``cameras_elevation`` between which angles over its
-    horizon, in degrees. What the user says counts more: with another centre, or an object, the
-    scene's own and its distance do not hold either.
+    horizon, in degrees, and ``keep_emitters`` which light sources are seen. What the user says
+    counts more: with another centre, or an object, the scene's own and its distance do not hold
+    either.
 
     Raises:
         InputError: for a default that is not as many finite numbers as expected.
@@ -38,6 +39,9 @@ def with_hints(file: SceneFile, options: Options) -> Options:
             found["radius"] = None if radius is None else radius[0]
     if options.elevation is None:
         found["elevation"] = _numbers(file, "cameras_elevation", 2)
+    if not options.keep_emitters:
+        kept = file.default("keep_emitters")
+        found["keep_emitters"] = None if kept is None else tuple(kept.replace(",", " ").split())
     return replace(options, **{name: value for name, value in found.items() if value is not None})
 
 

@@ -15,11 +15,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..base.arrays import Image
 from ..images.write import on_white
+
+# How many samples a pixel has: as many as any other, or (H, W, 1) numbers where some were dropped.
+Samples: TypeAlias = int | Image
 
 
 @dataclass(frozen=True)
@@ -40,30 +44,44 @@ class Noise:
         return {**asdict(self), "psnr_ceiling": self.psnr_ceiling}
 
 
-def estimate(a: Image, b: Image, samples: tuple[int, int]) -> Noise:
+def estimate(a: Image, b: Image, samples: tuple[Samples, Samples]) -> Noise:
     """The noise of the weighted mean of two renderings.
 
     Args:
         a, b: Linear premultiplied RGBA of the same view, (H, W, 4), independent.
-        samples: Samples a pixel of each.
+        samples: Samples a pixel of each. Pixels of which one has none tell nothing of noise,
+            and do not count.
     """
-    scale = math.sqrt(samples[0] * samples[1]) / sum(samples)
-    count = a[..., :3].size
     noisy = (a != b).any(axis=-1)  # empty background has no error
+    scale: Any
+    if isinstance(samples[0], int) and isinstance(samples[1], int):
+        scale, count = math.sqrt(samples[0] * samples[1]) / sum(samples), a[..., :3].size
+    else:
+        counts = (np.broadcast_to(np.float64(n), (*noisy.shape, 1)) for n in samples)
+        scale = _error_scale(*counts)
+        count = max(1, 3 * int((scale > 0).sum()))
+        scale = scale[noisy]
     a, b = a[noisy], b[noisy]
     linear = (a[..., :3] - b[..., :3]) * scale
     display = (on_white(a) - on_white(b)) * scale
     return Noise(
-        mse_linear=_sum(np.square(linear)) / count,
+        mse_linear=_sum(np.square(linear, dtype=np.float64)) / count,
         mse_srgb=_sum(np.square(display)) / count,
         mse_8bit=_sum(_rounded_squares(display)) / count,
     )
 
 
-def mean_image(a: Image, b: Image, samples: tuple[int, int]) -> Image:
+def mean_image(a: Image, b: Image, samples: tuple[Samples, Samples]) -> Image:
     """The mean of two renderings, weighted by their samples a pixel."""
-    share = samples[0] / sum(samples)
+    total: Any = samples[0] + samples[1]
+    share: Any = samples[0] / (total if isinstance(total, int) else np.maximum(total, 1))
     return (a * share + b * (1 - share)).astype(np.float32)
+
+
+def _error_scale(a: Image, b: Image) -> Image:
+    """√(ab)/(a + b), or 0: how far the mean of so many samples is off, by their difference."""
+    scale: Image = np.sqrt(a * b) / np.maximum(a + b, 1)
+    return scale
 
 
 def _sum(values: Image) -> float:

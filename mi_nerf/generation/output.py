@@ -27,8 +27,7 @@ Array = np.ndarray[Any, Any]
 
 def write_view(folder: Path, view: View, traced: TracedView, plan: Plan) -> dict[str, Any]:
     """Writes the four pictures of a view; returns its entry of ``dataset.json``."""
-    samples = plan.halves
-    image = mean_image(*traced.halves, samples)
+    image = mean_image(*traced.halves, traced.samples)
     stem = folder / view.name
     write_picture(_with(stem, ".png"), image)
     write_exr(_with(stem, ".exr"), image)
@@ -36,7 +35,8 @@ def write_view(folder: Path, view: View, traced: TracedView, plan: Plan) -> dict
     write_exr(_with(stem, "_normal.exr"), traced.normal)
     bounds = depth_bounds(plan.camera_of(view), traced.depth)
     return {
-        "noise": estimate(*traced.halves, samples).record(),
+        "noise": estimate(*traced.halves, traced.samples).record(),
+        "invalid_samples": traced.invalid,
         "depth_bounds": None if bounds is None else list(bounds),
         "sha256": {path.name: file_digest(path) for path in view_files(folder, view)},
     }

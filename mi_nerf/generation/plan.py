@@ -62,6 +62,7 @@ class Plan:
     subject: Subject  # what of the scene is the object
     survey: Survey = field(compare=False, repr=False)  # what the cameras will see
     notes: tuple[str, ...] = ()  # what people should know, a line each
+    keep_emitters: tuple[str, ...] = ()  # light sources that are seen all the same
 
     @property
     def halves(self) -> tuple[int, int]:
@@ -129,6 +130,7 @@ class Plan:
             "center": list(self.center),
             "radius": self.radius,
             **({} if self.elevation is None else {"elevation": list(self.elevation)}),
+            **({"keep_emitters": list(self.keep_emitters)} if self.keep_emitters else {}),
         }
         return {**record, **self.subject.record()}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..scene_xml.parts import Part, read_parts
 from ..scene_xml.scene_file import Bounds, SceneFile
 from ..scene_xml.sensors import named_ups
 from .choosing import Choice, Situation, choose, protocol_name
+from .emitters import Hidden
 from .plan import Plan, halves
 from .protocol import Options
 from .sensors import SensorCamera, read_sensors
@@ -27,12 +29,15 @@ _THIN = 1e-3  # of its largest extent a box has at least in each direction: read
 _MARGIN = 0.05  # around what is seen of a room
 
 
-def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Plan:
+def make_plan(
+    file: SceneFile, scene: Any, box: Bounds, options: Options, hidden: Hidden | None = None
+) -> Plan:
     """Decides everything that the user left open.
 
     Args:
         scene: ``file``, loaded.
         box: Of the visible shapes of ``scene``.
+        hidden: Light sources that cameras around the object do not see; default: all.
 
     Raises:
         InputError: for options that make no sense, alone or for this scene.
@@ -40,14 +45,14 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
     protocol_name(file, options)  # is known
     spp = _samples(file, scene, options)
     sensors = read_sensors(scene) if file.plugins("Sensor") else []
-    parts = read_parts(file)
+    parts = _with_kept(read_parts(file), scene, hidden)
     box = _with_merged(box, parts)
     if options.up is None:
         up, why = vertical(sensors, named_ups(file), parts)
     else:
         up, why = told_up(options.up), "what was told"
     subject = _subject(parts, box, sensors, options)
-    choice = choose(Situation(file, scene, box, up, sensors, subject, options))
+    choice = choose(Situation(file, scene, box, up, sensors, subject, options, hidden or True))
     return Plan(
         protocol=choice.protocol,
         cameras=choice.shots.cameras,
@@ -64,6 +69,7 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
         hide_emitters=choice.survey.hide_emitters,
         subject=choice.subject,
         survey=choice.survey,
+        keep_emitters=options.keep_emitters,
         notes=(
             f"up is taken from {why}",
             *filter(None, [str(choice.subject)]),
@@ -72,6 +78,14 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
             str(choice.survey),
         ),
     )
+
+
+def _with_kept(parts: Sequence[Part], scene: Any, hidden: Hidden | None) -> list[Part]:
+    """The parts, of which light sources that are seen are like others."""
+    if hidden is None or not hidden.chosen:
+        return list(parts)
+    kept = {s.id() for s in scene.shapes() if s.is_emitter() and hidden.keeps(s)}
+    return [replace(part, glows=part.glows and part.name not in kept) for part in parts]
 
 
 def _with_merged(box: Bounds, parts: Sequence[Part]) -> Bounds:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import numpy as np
 
+from ..base.arrays import Mask
 from ..cameras.pinhole import Intrinsics
 
 Array = np.ndarray[Any, Any]
+Hides = bool | Callable[[Any], Mask]  # which light sources are not seen
 
 _MAX_INTERFACES = 64  # that a ray may pass before it counts as lost
 _RAYS = 1 << 20  # at once
@@ -37,7 +39,7 @@ class Hits:
         return np.minimum(self.distance, self.fog)
 
 
-def first_hits(scene: Any, origins: Array, directions: Array, *, hide_emitters: bool) -> Hits:
+def first_hits(scene: Any, origins: Array, directions: Array, *, hide_emitters: Hides) -> Hits:
     """Follows rays to the first surface. A Mitsuba variant must be set.
 
     Surfaces that let more than half of the light straight through do not count; nor do light
@@ -45,6 +47,7 @@ def first_hits(scene: Any, origins: Array, directions: Array, *, hide_emitters: 
 
     Args:
         origins, directions: (N, 3); directions of unit length.
+        hide_emitters: Whether all, or a function of light sources that says which.
     """
     found = []
     for start in range(0, len(origins), _RAYS):
@@ -53,6 +56,12 @@ def first_hits(scene: Any, origins: Array, directions: Array, *, hide_emitters: 
         found.append([np.array(values) for values in _follow(scene, ray, hide_emitters)])
     distance, dark, fog = (np.concatenate(parts) for parts in zip(*found, strict=True))
     return Hits(distance, dark, fog)
+
+
+def _hides(hide: Hides, emitter: Any) -> Mask:
+    import mitsuba as mi
+
+    return mi.Bool(hide) & (emitter != None) if isinstance(hide, bool) else hide(emitter)  # noqa: E711
 
 
 def blocked(scene: Any, origins: Array, targets: Array) -> Array:
@@ -95,7 +104,7 @@ def _rays(origins: Array, directions: Array) -> Any:
 
 
 @dr.syntax  # type: ignore[untyped-decorator]
-def _follow(scene: Any, ray: Any, hide_emitters: bool) -> tuple[Any, Any, Any]:
+def _follow(scene: Any, ray: Any, hide_emitters: Hides) -> tuple[Any, Any, Any]:
     """Distance of the first solid surface, whether it is dark, distance of the first medium."""
     import mitsuba as mi
 
@@ -113,7 +122,7 @@ def _follow(scene: Any, ray: Any, hide_emitters: bool) -> tuple[Any, Any, Any]:
         flags = bsdf.flags()
         is_null = mi.has_flag(flags, mi.BSDFFlags.Null)
         through = dr.mean(bsdf.eval_null_transmission(si, active & is_null))
-        hidden = mi.Bool(hide_emitters) & direct & (si.emitter(scene) != None)  # noqa: E711
+        hidden = _hides(hide_emitters, si.emitter(scene)) & direct
         opens = is_null & (through > 0.5) & ~hidden
         found = active & ~hidden & ~opens
         away = dr.norm(si.p - origin)

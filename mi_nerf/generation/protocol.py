@@ -54,3 +54,4 @@ class Options:
     radius: float | None = None  # their distance from it; forward: how far they move sideways
     elevation: tuple[float, float] | None = None  # of 360-degree cameras over its horizon, degrees
     object: tuple[str, ...] | None = None  # the shapes that cameras look at; found by size
+    keep_emitters: tuple[str, ...] = ()  # IDs of light sources that are seen, or "all"

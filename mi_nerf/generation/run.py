@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,10 @@ from ..base.variants import using_variant
 from ..scene_xml.scene_file import Bounds, SceneFile, visible_bounds
 from ..scene_xml.scene_file import quiet as _quiet
 from ..scene_xml.sensors import separate_sensors
+from .emitters import ALL, Hidden
 from .hints import with_hints
+from .integrators import color_integrator, is_adjoint, require_choice
+from .notes import memory_line, notes
 from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View
 from .plan_picture import PICTURE, draw
@@ -73,11 +76,12 @@ def generate(
         with _quiet():
             file = SceneFile(scene, parameters)
             tracer, plan = prepare(file, options or Options())
+            told = [*notes(plan), memory_line(plan, tracer.samples_at_once)]
         record = json.loads(json.dumps(_describe(file, plan, variant)))  # as it will be read
         if resume and (folder / RECORD).exists():
             record["views"] = _resumed_views(folder, record, plan)
         if show:
-            print(*file.notes, plan, sep="\n", flush=True)
+            print(*file.notes, plan, *told, sep="\n", flush=True)
         return _trace_views(folder, tracer, plan, record, show)
 
 
@@ -110,7 +114,7 @@ def preview(
     with using_variant(variant):
         with _quiet():
             file = SceneFile(scene, parameters)
-            plan = _plan(file, options or Options())[-1]
+            plan = _plan(file, options or Options())[1]
     if show:
         print(*file.notes, plan, sep="\n", flush=True)
     make_folder(picture.parent)
@@ -162,41 +166,72 @@ def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
     """Loads the scene and decides what to make of it."""
     import mitsuba as mi
 
-    file, scene, plan = _plan(file, options)
+    loaded, plan = _plan(file, options)
+    scene, hidden = loaded.scene, loaded.hidden
+    integrator = color_integrator(scene.integrator(), file.path)
+    require_choice(integrator, hidden, file.path)
+    if hidden.chosen and not is_adjoint(integrator):
+        integrator.hide_emitters = hidden.any and not hidden.partly
     has_sampler = bool(file.plugins("Sampler")) and bool(file.plugins("Sensor"))
     sampler = scene.sensors()[0].sampler() if has_sampler else mi.load_dict({"type": "independent"})
     _check_sampler(sampler, plan)
-    return Tracer(scene, scene.integrator(), sampler, plan), plan
+    return Tracer(scene, integrator, sampler, plan, hidden), plan
 
 
-def _plan(file: SceneFile, options: Options) -> tuple[SceneFile, Any, Plan]:
-    """The file as it was loaded, its scene, and what to make of it."""
+@dataclass(frozen=True, eq=False)
+class _Loaded:
+    """A scene as cameras of one protocol see it."""
+
+    file: SceneFile
+    scene: Any
+    hidden: Hidden  # light sources
+    box: Bounds  # of what is visible
+    notes: list[str]  # what was changed
+
+
+def _plan(file: SceneFile, options: Options) -> tuple[_Loaded, Plan]:
+    """The scene, and what to make of it."""
     options = with_hints(file, options)
     hide = protocol_name(file, options) not in ("forward", "room")
-    notes, scene, box = _load(file, hide)
-    plan = make_plan(file, scene, box, options)
+    if options.keep_emitters and not hide:
+        raise InputError(
+            "{}: has no meaning for the protocols 'forward' and 'room', which show all",
+            Option("keep_emitters", " ".join(options.keep_emitters)),
+        )
+    loaded = first = _load(file, options, hide)
+    plan = make_plan(file, loaded.scene, loaded.box, options, loaded.hidden)
     if plan.hide_emitters != hide:  # it is a room: its lamps are part of it
-        file = SceneFile(file.path, file.parameters)
-        _, scene, _ = _load(file, plan.hide_emitters)
-    return file, scene, replace(plan, notes=(*notes, *plan.notes))
+        again = SceneFile(file.path, file.parameters)
+        loaded = _load(again, replace(options, keep_emitters=()), plan.hide_emitters)
+        plan = replace(plan, keep_emitters=())
+    return loaded, replace(plan, notes=(*first.notes, *plan.notes))
 
 
-def _load(file: SceneFile, hide_emitters: bool) -> tuple[list[str], Any, Bounds]:
-    """What was changed of the scene, the scene, and the box of what is visible in it."""
+def _load(file: SceneFile, options: Options, hide: bool) -> _Loaded:
+    """Loads a scene whose light sources are hidden, but for those that are kept."""
     file.substitute("Film", "Integrator", "ReconstructionFilter", "Sampler", "Sensor")
     file.complete()
-    if hide_emitters:
-        for properties in file.plugins("Integrator"):
-            properties["hide_emitters"] = True
+    for properties in file.plugins("Integrator"):
+        if hide:
+            properties["hide_emitters"] = ALL not in options.keep_emitters
+        if "samples_per_pass" in properties:  # which would have to divide every pass of ours
+            del properties["samples_per_pass"]
     notes = separate_sensors(file.state)
     scene = file.load()
     media = (shape.interior_medium() for shape in scene.shapes())
     if not scene.emitters() and not any(hasattr(medium, "field") for medium in media):
         raise InputError(f"{file.path}: has no emitter, all images would be black")
-    box = visible_bounds(scene)
+    hidden = Hidden(scene, hide, options.keep_emitters)
+    box = visible_bounds(scene, hidden.keeps)
     if box is None or not np.ptp(np.array(box), axis=0).any():
+        if hidden.any and visible_bounds(scene, lambda shape: True) is not None:
+            raise InputError(
+                "{}: all its shapes are light sources, which cameras do not see, expected {}",
+                file.path,
+                Option("keep_emitters", ALL),
+            )
         raise InputError(f"{file.path}: its box is empty, expected shapes that can be seen")
-    return notes, scene, box
+    return _Loaded(file, scene, hidden, box, notes)
 
 
 def _check_sampler(sampler: Any, plan: Plan) -> None:

@@ -10,7 +10,7 @@ import drjit as dr
 import numpy as np
 
 from ..cameras.pinhole import Intrinsics
-from .probes import camera_rays, first_hits
+from .probes import Hides, camera_rays, first_hits
 from .subject import Subject
 
 Array = np.ndarray[Any, Any]
@@ -58,7 +58,7 @@ def look(
     poses: Sequence[Array],
     intrinsics: Sequence[Intrinsics],
     *,
-    hide_emitters: bool,
+    hide_emitters: Hides,
 ) -> Survey:
     """Asks cameras, evenly spread over those given, what they see. A variant must be set."""
     count = min(_CAMERAS, len(poses))
@@ -80,16 +80,18 @@ def look(
         of_object=of_object,
         lit=_lit(scene, points - 1e-4 * hits.nearest[seen, None] * d[seen]),
         nearest=float(hits.nearest.min()),
-        hide_emitters=hide_emitters,
+        hide_emitters=hide_emitters is not False,
     )
 
 
-def sees(scene: Any, subject: Subject, poses: Array, intrinsics: Intrinsics) -> Array:
+def sees(
+    scene: Any, subject: Subject, hide_emitters: Hides, poses: Array, intrinsics: Intrinsics
+) -> Array:
     """Which cameras see the object from its front, (N,). ``poses`` are (N, 4, 4)."""
     o, d = camera_rays(list(poses), [intrinsics] * len(poses), _COARSE)
     shape = o.shape[:2]
     o, d = o.reshape(-1, 3), d.reshape(-1, 3)
-    hits = first_hits(scene, o, d, hide_emitters=True)
+    hits = first_hits(scene, o, d, hide_emitters=hide_emitters)
     front = hits.something & ~hits.dark
     points = o[front] + hits.nearest[front, None].astype(np.float64) * d[front]
     seen = np.zeros(len(o), bool)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -181,12 +181,18 @@ def quiet() -> Iterator[None]:
         mi.set_log_level(level)
 
 
-def visible_bounds(scene: Any) -> Bounds | None:
-    """The corners of the box around all shapes that are no light sources; None without any."""
+def visible_bounds(scene: Any, kept: Callable[[Any], bool] = lambda shape: False) -> Bounds | None:
+    """The corners of the box around all shapes that are seen; None without any.
+
+    Args:
+        kept: Whether a shape that is a light source is seen.
+    """
     corners = []
     for shape in scene.shapes():
         box = shape.bbox()
-        if not shape.is_emitter() and box.valid():  # what was merged into another has none
+        if (
+            not shape.is_emitter() or kept(shape)
+        ) and box.valid():  # what was merged into another has none
             corners.append([np.ravel(box.min), np.ravel(box.max)])
     if not corners:
         return None

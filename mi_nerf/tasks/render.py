@@ -139,9 +139,9 @@ def scene_frames(
 
     import mitsuba as mi
 
-    def render(scene: Any, sensor: Any, seed: int = 0) -> Image:
+    def render(scene: Any, samples: int, sensor: Any, seed: int = 0) -> Image:
         try:
-            return _rgba(mi.render(scene, sensor=sensor, spp=spp, seed=seed), sensor.film())
+            return _picture(scene, sensor, samples, seed)
         except RuntimeError as error:  # Dr.Jit wraps what happens inside a custom operation
             if isinstance(error.__cause__, InputError):
                 raise InputError(f"{scene_path}: {error.__cause__}") from error
@@ -169,14 +169,15 @@ def scene_frames(
                     film = mi.traverse(sensor)
                     film["film.size"] = list(size)
                     film.update()
-            draw = partial(render, scene)
             if path is not None:
+                draw = partial(render, scene, spp or sensors[0].sampler().sample_count())
                 yield frames
                 yield from _moving(scene, sensors[0], path, frames, draw)
                 return
             yield len(sensors)
-            for i, sensor in enumerate(sensors):
-                yield f"sensor_{i:03d}", draw(sensor)
+            counts = [spp or sensor.sampler().sample_count() for sensor in sensors]
+            for i, (sensor, count) in enumerate(zip(sensors, counts, strict=True)):
+                yield f"sensor_{i:03d}", render(scene, count, sensor)
 
     produced = produce()
     return next(produced), produced
@@ -311,6 +312,30 @@ def _resized(intrinsics: Intrinsics, size: tuple[int, int] | None) -> Intrinsics
 def _linear_rgba(color: Image, opacity: Image, color_space: str) -> Image:
     radiance = linear_premultiplied(color, opacity, color_space)
     return np.concatenate([radiance, opacity[..., None]], axis=-1).astype(np.float32)
+
+
+def _picture(scene: Any, sensor: Any, spp: int, seed: int) -> Image:
+    """A picture of a Mitsuba scene, in sets of samples whose memory is bounded.
+
+    Integrators of fields divide their work themselves, and keep the sampler's pattern.
+    """
+    import mitsuba as mi
+
+    from ..generation.passes import sets
+
+    film, sampler = sensor.film(), sensor.sampler()
+    pixels = int(np.prod(np.array(film.crop_size(), np.int64)))
+    ours = type(scene.integrator()).__module__.startswith("mi_nerf.")
+    parts = [spp] if ours else sets(spp, pixels, sampler)
+    if len(parts) == 1:
+        return _rgba(mi.render(scene, sensor=sensor, spp=spp, seed=seed), film)
+    seeds = [seed, *np.random.SeedSequence(seed).generate_state(len(parts) - 1, np.uint32)]
+    total: Any = 0.0
+    for count, own in zip(parts, seeds, strict=True):
+        # Read at once, so that sets do not pile up in memory.
+        total = total + _rgba(mi.render(scene, sensor=sensor, spp=count, seed=int(own)), film)
+    picture: Image = total / np.float32(len(parts))
+    return picture
 
 
 def _rgba(image: Any, film: Any) -> Image:
