@@ -12,7 +12,7 @@ from ..api import generate
 from ..base.variants import choose_variant
 from ..generation import Options
 from ..generation.run import summary
-from .shared import Variant, name_and_value
+from .shared import ExecutorName, Variant, Workers, name_and_value
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,8 @@ class Generate:
     mi-nerf generate my_scene.xml data/mine --up y --cameras sphere --seed 1
 
     mi-nerf generate bonsai data/bonsai --resume
+
+    mi-nerf generate bonsai data/bonsai --workers 4
     """
 
     scene: Positional[Annotated[str, arg(metavar="SCENE")]]
@@ -60,6 +62,8 @@ class Generate:
     """Distance from it (forward: how far cameras move); default: 4, or as the scene's size says."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Values of the scene's $parameters: name=value; repeatable."""
+    workers: Workers = 0
+    executor: ExecutorName = None
     variant: Variant = None
 
     def run(self, _started: float) -> None:
@@ -71,6 +75,8 @@ class Generate:
             **options,
             parameters=dict(name_and_value(text) for text in self.set),
             resume=self.resume,
+            workers=self.workers,
+            executor=self.executor,
             variant=choose_variant(self.variant),
         )
         hint = "" if record["complete"] else ", go on with --resume"

@@ -1,0 +1,7 @@
+"""Lists of independent jobs, done by other processes of this machine or by a cluster."""
+
+from .executors import open_executor
+from .permit import Permit, permitted
+from .run import Job, JobError, run_jobs, together
+
+__all__ = ["Job", "JobError", "Permit", "open_executor", "permitted", "run_jobs", "together"]
