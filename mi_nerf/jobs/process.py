@@ -107,9 +107,9 @@ def _reply(request: bytes) -> bytes:
 
 
 def outcome(function: Callable[..., Any], arguments: tuple[Any, ...]) -> bytes:
-    """Calls a job's function; what has come of it is for :func:`pass_on`, elsewhere."""
+    """Calls a function; what has come of it is for :func:`pass_on`, elsewhere."""
     try:
-        return pickle.dumps((True, perform(function, *arguments)))
+        return pickle.dumps((True, function(*arguments)))
     except BaseException as error:
         return _raised(error)
 
