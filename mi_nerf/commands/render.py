@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -59,7 +59,7 @@ class Render:
         if self.size is not None:
             valid_size(self.size)
         check_output(self.out, self.frames or 1)
-        wanted = {
+        wanted: dict[str, Any] = {
             "path": self.path,
             "frames": self.frames,
             "still": output_kind(self.out) == "picture",

@@ -118,7 +118,7 @@ def training_curves(
     look = partial(_look, split=split, views=views)
     train = partial(
         _train,
-        data=settings["data"],
+        data=str(settings["data"]),
         folder=folder.absolute(),
         variant=variant,
         looks=looks,
