@@ -2,6 +2,7 @@
 
 from .executors import open_executor
 from .permit import Permit, permitted
-from .run import Job, JobError, run_jobs, together
+from .process import JobError
+from .run import Job, run_jobs, together
 
 __all__ = ["Job", "JobError", "Permit", "open_executor", "permitted", "run_jobs", "together"]

@@ -22,6 +22,10 @@ _LENGTH = struct.Struct("<Q")
 _TURN = threading.Lock()
 
 
+class JobError(RuntimeError):
+    """A job cannot be done, not for its own fault; the message names it, or what is missing."""
+
+
 class WorkerDiedError(RuntimeError):
     """A process ended in the middle of a job; the message says how."""
 

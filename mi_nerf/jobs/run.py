@@ -8,7 +8,7 @@ from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future
 from typing import Any, NamedTuple
 
 from .permit import NotPermittedError, Permit
-from .process import WorkerDiedError, perform
+from .process import JobError, WorkerDiedError, perform
 
 TRIES = 3
 _SECONDS_BETWEEN_LOOKS = 0.1  # at a request to stop
@@ -21,10 +21,6 @@ class Job(NamedTuple):
     name: str  # in messages
     function: Callable[..., Any]  # found by its name where it runs
     arguments: tuple[Any, ...] = ()
-
-
-class JobError(RuntimeError):
-    """A job whose process died whenever it was tried; the message names it."""
 
 
 def run_jobs(

@@ -14,13 +14,15 @@ import pytest
 
 from mi_nerf.base.errors import InputError
 from mi_nerf.cli import main
-from mi_nerf.jobs import Job, open_executor, permitted, run_jobs
+from mi_nerf.jobs import Job, JobError, open_executor, permitted, run_jobs
 from tests.generation.test_run import ball, contents, make
 from tests.generation.test_workers import few
 from tests.support import jobs as work
 from tests.support.dask_cluster import Cluster, dask_cluster
 
 pytest.importorskip("distributed")
+import dask  # noqa: E402
+
 pytestmark = [
     pytest.mark.slow,
     # Of the client's threads and sockets, when schedulers and workers are killed.
@@ -103,6 +105,20 @@ def test_the_command(cluster: Cluster, tmp_path: Path, capsys: pytest.CaptureFix
     text, errors = capsys.readouterr()
     assert "of tcp://127.0.0.1:" in text and "3 views of 16x16" in text and errors == ""
     assert json.loads((out / "dataset.json").read_text())["complete"]
+
+
+def test_a_scheduler_that_goes(cluster: Cluster, tmp_path: Path) -> None:
+    """One line, after some seconds in which the client tries to find it again."""
+    with (
+        dask.config.set({"distributed.comm.timeouts.connect": "1s"}),
+        pytest.raises(JobError, match="^tcp://127.0.0.1:.*: the scheduler is gone$"),
+        open_executor(executor=cluster.address, folder=tmp_path) as executor,
+        permitted(tmp_path / "out") as permit,
+    ):
+        assert executor is not None
+        threading.Timer(3, cluster.scheduler.kill).start()
+        jobs = [Job(f"job {n}", work.until_withdrawn, (permit,)) for n in range(3)]
+        run_jobs(jobs, executor, permit, print)
 
 
 def test_no_scheduler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
