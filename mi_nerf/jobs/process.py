@@ -130,10 +130,14 @@ def _raised(error: BaseException) -> bytes:
 
 def pass_on(reply: bytes, future: Future[Any]) -> None:
     """Tells those who wait for a job what :func:`outcome` says of it."""
-    good, result = pickle.loads(reply)
+    try:
+        good, result = pickle.loads(reply)
+    except Exception as error:  # of a kind that is not known here
+        good, result = False, (error, "")
     if good:
         future.set_result(result)
         return
     error, text = result
-    error.__cause__ = RemoteError(text)
+    if text:
+        error.__cause__ = RemoteError(text)
     future.set_exception(error)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ..base.errors import InputError
-from ..base.files import make_folder, read_json, write_json
+from ..base.files import make_folder, read_json, remove_leftovers, write_json
 from ..base.interrupts import interruptible
 from ..base.progress_bar import progress_bar
 from ..jobs import Job, Permit, open_executor, permitted, run_jobs
@@ -182,6 +182,8 @@ def trained(
     if (folder / RESULT).exists():
         found: Result = read_json(folder / RESULT, "the evaluation of a run")
         return found
+    if folder.is_dir():
+        remove_leftovers(folder)
     if (folder / CONFIG).exists():
         config, _ = read_config(folder)
     started = time.monotonic()

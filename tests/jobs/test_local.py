@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -50,6 +51,10 @@ def test_errors_come_back_with_where_they_were_raised(two: LocalWorkers) -> None
     assert "in refuse" in str(error.__cause__)
     error = two.submit(work.fail_stubbornly).exception()
     assert isinstance(error, RuntimeError) and str(error) == "StubbornError: 1 and 2"
+    with pytest.raises(ImportError, match="not here"):
+        two.submit(work.give_what_cannot_be_read).result()
+    with pytest.raises((AttributeError, pickle.PicklingError)):
+        two.submit(lambda: 1)
     assert two.submit(work.total, 1).result()[0] == 1
 
 

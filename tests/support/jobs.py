@@ -54,6 +54,23 @@ def fail_stubbornly() -> None:
     raise StubbornError(1, 2)
 
 
+class Local:
+    """Is known where it was made, and nowhere else."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _only_in, (os.getpid(),)
+
+
+def _only_in(pid: int) -> None:
+    if os.getpid() != pid:
+        raise ImportError("not here")
+
+
+def give_what_cannot_be_read() -> Local:
+    """A result that can be written here and read nowhere else."""
+    return Local()
+
+
 def nap(seconds: float, started: Path) -> int:
     """Says that it has begun, waits, and names its process."""
     started.write_text(str(os.getpid()))
