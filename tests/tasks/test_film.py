@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import imageio.v3 as iio
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -42,11 +43,15 @@ def test_a_video_and_a_picture_of_a_scene(tmp_path: Path) -> None:
     options = ["--path", "orbit", "--frames", "5", "--size", "32", "32", "--spp", "4"]
     rendered(scene, "-o", tmp_path / "one.mp4", *options)
     rendered(scene, "-o", tmp_path / "two.mp4", *options, "--workers", "2")
-    one, two = (iio.imread(tmp_path / name) for name in ("one.mp4", "two.mp4"))
-    assert one.shape == (5, 32, 32, 3) and np.array_equal(one, two)
-    rendered(scene, "-o", tmp_path / "one.exr", "--spp", "4")
-    rendered(scene, "-o", tmp_path / "two.exr", "--spp", "4", "--workers", "1")
-    assert (tmp_path / "one.exr").read_bytes() == (tmp_path / "two.exr").read_bytes()
+    one, two = (iio.imread(tmp_path / name).astype(int) for name in ("one.mp4", "two.mp4"))
+    # Mitsuba adds up what its filter spreads in an order of chance: last bits differ.
+    assert one.shape == (5, 32, 32, 3) and np.abs(one - two).max() <= 2
+    assert np.abs(one[0] - one[2]).max() > 20
+    options = ["--size", "24", "24", "--spp", "4"]
+    rendered(scene, "-o", tmp_path / "one.exr", *options)
+    rendered(scene, "-o", tmp_path / "two.exr", *options, "--workers", "1")
+    images = [np.array(mi.Bitmap(str(tmp_path / name))) for name in ("one.exr", "two.exr")]
+    assert images[0].shape == (24, 24, 4) and np.allclose(*images, atol=1e-5)
 
 
 @pytest.mark.slow

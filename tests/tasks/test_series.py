@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,8 +91,7 @@ def test_a_worker_that_dies(blob: Path, tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_ctrl_c_and_another_number_of_workers(blob: Path, tmp_path: Path) -> None:
     """Trainings are saved where they are, and go on from there."""
-    config = tiny()
-    config = type(config)(**{**vars(config), "steps": 3000})
+    config = replace(tiny(), steps=1500)
     whole = ablate(blob, tmp_path / "whole", config, VARIANT, rows=["no-h"])
 
     out = tmp_path / "out"
