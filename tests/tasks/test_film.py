@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import imageio.v3 as iio
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -13,6 +12,7 @@ from mi_nerf.cli import main
 from mi_nerf.tasks.film import _parts
 from tests.generation.test_run import SENSOR_Y_UP, ball, contents
 from tests.support.processes import children
+from tests.tasks.test_render import read_video
 
 
 def test_parts_are_all_numbers_in_order() -> None:
@@ -43,7 +43,7 @@ def test_a_video_and_a_picture_of_a_scene(tmp_path: Path) -> None:
     options = ["--path", "orbit", "--frames", "5", "--size", "32", "32", "--spp", "4"]
     rendered(scene, "-o", tmp_path / "one.mp4", *options)
     rendered(scene, "-o", tmp_path / "two.mp4", *options, "--workers", "2")
-    one, two = (iio.imread(tmp_path / name).astype(int) for name in ("one.mp4", "two.mp4"))
+    one, two = (read_video(tmp_path / name).astype(int) for name in ("one.mp4", "two.mp4"))
     # Mitsuba adds up what its filter spreads in an order of chance: last bits differ.
     assert one.shape == (5, 32, 32, 3) and np.abs(one - two).max() <= 2
     assert np.abs(one[0] - one[2]).max() > 20
