@@ -7,6 +7,7 @@ Mitsuba variant holds if it is one that mi_nerf works with, otherwise the best o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -58,6 +59,8 @@ def generate(
     parameters: Mapping[str, str] | None = None,
     resume: bool = False,
     plan: bool = False,
+    workers: int = 0,
+    executor: str | Executor | None = None,
     variant: str | None = None,
     show: bool = True,
 ) -> dict[str, Any]:
@@ -81,6 +84,9 @@ def generate(
         parameters: values of the scene's ``$parameters``.
         plan: only draw where the cameras would stand: ``cameras.png`` in ``out``, or ``out``
             itself where it is the name of a picture. Nothing is rendered.
+        workers: so many processes of this machine make the views; default: this one alone.
+        executor: a cluster makes them, ``"dask://HOST:PORT"`` or ``"slurm"``, or the workers of
+            any ``concurrent.futures.Executor``. All see ``out`` and the scene by the same names.
         show: say what is made, and how far it is.
 
     Returns:
@@ -91,6 +97,7 @@ def generate(
 
     Raises:
         InputError: if anything is not as expected; existing files are as they were.
+        JobError: of :mod:`mi_nerf.jobs`, if the process that makes a view dies again and again.
     """
     from . import generation
     from .scene_xml.library import find_scene
@@ -124,6 +131,8 @@ def generate(
         options,
         parameters=parameters,
         resume=resume,
+        workers=workers,
+        executor=executor,
         show=show,
     )
 

@@ -17,6 +17,7 @@ from .base.errors import InputError
 from .commands import COMMANDS, all_commands, examples
 from .commands.shared import flag
 from .commands.usage import unknown_command, usage_error
+from .jobs import JobError
 from .training.run import TrainingError
 
 _LISTS = ("--set", "--vary", "--object")  # options that may be followed by several values
@@ -33,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         command.run(_process_start())
     except InputError as error:
         return _fail(error.told(flag), 2)
-    except TrainingError as error:
+    except (TrainingError, JobError) as error:
         return _fail(str(error), 1)
     except OSError as error:
         where = f"{error.filename}: " if error.filename else ""

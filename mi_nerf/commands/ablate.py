@@ -12,7 +12,7 @@ from ..base.variants import choose_variant
 from ..tasks.ablate import ROWS, ablate, table
 from ..training.config import with_settings
 from ..training.presets import preset
-from .shared import Variant, budget, positive
+from .shared import ExecutorName, Variant, Workers, budget, positive
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,8 @@ class Ablate:
     """Only so many of them, evenly spread."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Change any setting of all rows: key=value; repeatable."""
+    workers: Workers = 0
+    executor: ExecutorName = None
     variant: Variant = None
 
     def run(self, _started: float) -> None:
@@ -70,6 +72,8 @@ class Ablate:
             seeds=positive("seeds", self.seeds),
             split=self.split,
             views=self.views,
+            workers=self.workers,
+            executor=self.executor,
         )
         print(table(record))
         if not record["complete"]:

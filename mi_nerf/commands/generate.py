@@ -13,7 +13,7 @@ from ..base.errors import InputError
 from ..base.variants import choose_variant
 from ..generation import Options
 from ..generation.run import summary
-from .shared import Variant, name_and_value
+from .shared import ExecutorName, Variant, Workers, name_and_value
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,8 @@ class Generate:
     mi-nerf generate my_scene.xml data/mine --object teapot --plan
 
     mi-nerf generate bonsai data/bonsai --resume
+
+    mi-nerf generate bonsai data/bonsai --workers 4
     """
 
     scene: Positional[Annotated[str, arg(metavar="SCENE")]]
@@ -73,6 +75,8 @@ class Generate:
     """IDs of light sources that are part of the object and seen, or all; default: none is seen."""
     set: UseAppendAction[tuple[str, ...]] = ()
     """Values of the scene's $parameters: name=value; repeatable."""
+    workers: Workers = 0
+    executor: ExecutorName = None
     variant: Variant = None
 
     def run(self, _started: float) -> None:
@@ -87,6 +91,8 @@ class Generate:
             parameters=dict(name_and_value(text) for text in self.set),
             resume=self.resume,
             plan=self.plan,
+            workers=self.workers,
+            executor=self.executor,
             variant=choose_variant(self.variant),
         )
         if self.plan:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
 from ..base.checks import valid_size
 from ..base.variants import choose_variant
+from ..jobs import open_executor
 from ..scene_xml.library import scenes
+from ..tasks.film import FramesOf, frames_by_others
 from ..tasks.render import check_output, frames_of, output_kind, write_frames
-from .shared import Variant, positive, progress_bar
+from .shared import ExecutorName, Variant, Workers, positive, progress_bar
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,8 @@ class Render:
     mi-nerf render scene.xml -o scene.exr --spp 64
 
     mi-nerf render table -o table.png
+
+    mi-nerf render table -o film.mp4 --path orbit --workers 4
     """
 
     target: Positional[Annotated[Path, arg(metavar="TARGET")]]
@@ -43,6 +47,8 @@ class Render:
     """Width and height; default: those of the run's images or the scene's film."""
     spp: int | None = None
     """Samples a pixel; default: 1 for runs, the scene's own for XML."""
+    workers: Workers = 0
+    executor: ExecutorName = None
     variant: Variant = None
 
     def run(self, _started: float) -> None:
@@ -53,17 +59,25 @@ class Render:
         if self.size is not None:
             valid_size(self.size)
         check_output(self.out, self.frames or 1)
-        count, images = frames_of(
-            self._target(),
-            choose_variant(self.variant),
-            path=self.path,
-            frames=self.frames,
-            still=output_kind(self.out) == "picture",
-            size=self.size,
-            spp=self.spp,
-        )
-        with progress_bar("render", "frame", count) as bar:
-            write_frames(self.out, count, images, on_frame=bar.update)
+        wanted: dict[str, Any] = {
+            "path": self.path,
+            "frames": self.frames,
+            "still": output_kind(self.out) == "picture",
+            "size": self.size,
+            "spp": self.spp,
+        }
+        variant = choose_variant(self.variant)
+        with open_executor(self.workers, self.executor, folder=self.out) as others:
+            count, images = frames_of(self._target(), variant, **wanted)
+            check_output(self.out, count)
+            with progress_bar("render", "frame", count) as bar:
+                if others is None:
+                    write_frames(self.out, count, images, on_frame=bar.update)
+                else:
+                    images.close()
+                    call = FramesOf(self._target(), variant, wanted)
+                    with frames_by_others(call, count, others, self.out, bar.update) as drawn:
+                        write_frames(self.out, count, drawn)
         print(f"{self.out}: {count} frame{'s' if count != 1 else ''}")
 
     def _target(self) -> Path:

@@ -16,7 +16,16 @@ from ..report import Knobs, report, report_training, rows_of
 from ..report.curves_text import conclusions
 from ..report.profile import summary
 from ..report.subject import RAYS
-from .shared import Variant, budget, name_and_value, positive, progress_bar, valid_seed
+from .shared import (
+    ExecutorName,
+    Variant,
+    Workers,
+    budget,
+    name_and_value,
+    positive,
+    progress_bar,
+    valid_seed,
+)
 
 _KNOBS = Knobs()
 
@@ -95,6 +104,8 @@ class Report:
     """Parameters of a formula, or settings of all trainings: key=value; repeatable."""
     seed: int = 0
     """Chance: which pixels are drawn; the first seed of trainings."""
+    workers: Workers = 0
+    executor: ExecutorName = None
     variant: Variant = None
 
     def run(self, _started: float) -> None:
@@ -110,7 +121,7 @@ class Report:
             self._report(self.out)
 
     def _report(self, out: Path) -> None:
-        for name in ("vary", "max_seconds", "steps"):
+        for name in ("vary", "max_seconds", "steps", "workers", "executor"):
             if getattr(self, name):
                 option = name.replace("_", "-")
                 raise InputError(f"--{option}: of trainings, expected --train DATA, no TARGET")
@@ -173,6 +184,8 @@ class Report:
             looks=self.looks,
             given=[*vary, *(assignment.partition("=")[0] for assignment in self.set)],
             on_run=lambda name, seed: print(f"{name}, seed {seed}", flush=True),
+            workers=self.workers,
+            executor=self.executor,
         )
         for sentence in conclusions(record):
             print(sentence)

@@ -10,10 +10,28 @@ from ..base.checks import positive, valid_seed
 from ..base.errors import InputError, Option
 from ..base.progress_bar import progress_bar
 
-__all__ = ["Variant", "budget", "flag", "name_and_value", "positive", "progress_bar", "valid_seed"]
+__all__ = [
+    "ExecutorName",
+    "Variant",
+    "Workers",
+    "budget",
+    "flag",
+    "name_and_value",
+    "positive",
+    "progress_bar",
+    "valid_seed",
+]
 
 Variant = Annotated[
     str | None, arg(help="Mitsuba variant; default: CUDA where it works, LLVM otherwise.")
+]
+
+Workers = Annotated[
+    int, arg(help="Processes of this machine that share the work; default: this one alone.")
+]
+ExecutorName = Annotated[
+    str | None,
+    arg(help="A cluster that does it: dask://HOST:PORT, slurm or slurm:partition=NAME,…"),
 ]
 
 

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 import json
+import pickle
+import platform
+import shutil
 import time
-from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..base.errors import InputError, Option
-from ..base.files import check_folder, make_folder, read_json, write_json
+from ..base.files import check_folder, make_folder, read_json, remove_leftovers, write_json
 from ..base.interrupts import interruptible
 from ..base.machine import versions
 from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
+from ..jobs import Job, Permit, open_executor, permitted, run_jobs, together
 from ..scene_xml.scene_file import Bounds, SceneFile, visible_bounds
 from ..scene_xml.scene_file import quiet as _quiet
 from ..scene_xml.sensors import separate_sensors
@@ -35,6 +41,9 @@ from .tracer import Tracer
 RECORD = "dataset.json"
 VERSION = 1
 
+# Of a record: what must be the same for views to belong to one dataset.
+_SAME = ("format", "version", "scene", "settings", "variant", "versions")
+
 _SECONDS_BETWEEN_SAVES = 5.0
 _SECONDS_BETWEEN_LINES = 10.0
 
@@ -48,6 +57,8 @@ def generate(
     parameters: Mapping[str, str] | None = None,
     resume: bool = False,
     show: bool = True,
+    workers: int = 0,
+    executor: str | Executor | None = None,
 ) -> dict[str, Any]:
     """Path-traces a dataset from a Mitsuba scene.
 
@@ -59,12 +70,15 @@ def generate(
         variant: Mitsuba variant.
         options: Views, size, samples, cameras.
         parameters: Values of the scene's ``$parameters``.
+        workers, executor: Who makes the views, as in :func:`mi_nerf.jobs.open_executor`;
+            this process by default.
 
     Returns:
         The content of ``dataset.json``; its ``complete`` is false after Ctrl-C.
 
     Raises:
         InputError: if anything is not as expected; existing files are as they were.
+        JobError: if the process that makes a view dies again and again.
     """
     if "_mono" in variant:
         raise InputError(
@@ -72,7 +86,8 @@ def generate(
         )
     folder = Path(out)
     _check_output(folder, resume)
-    with using_variant(variant):
+    source = _source(scene, variant, options or Options(), parameters)
+    with _crew(folder, source, workers, executor) as others, using_variant(variant):
         with _quiet():
             file = SceneFile(scene, parameters)
             tracer, plan = prepare(file, options or Options())
@@ -82,7 +97,11 @@ def generate(
             record["views"] = _resumed_views(folder, record, plan)
         if show:
             print(*file.notes, plan, *told, sep="\n", flush=True)
-        return _trace_views(folder, tracer, plan, record, show)
+        if others is None:
+            return _trace_views(folder, tracer, plan, record, show)
+        if show:
+            print(f"views are traced by {others}", flush=True)
+        return _hand_out_views(folder, others, source, plan, record, show)
 
 
 def preview(
@@ -278,20 +297,25 @@ def _resumed_views(folder: Path, record: dict[str, Any], plan: Plan) -> dict[str
     found = read_json(path, "the record of a dataset")
     if not isinstance(found, dict) or not isinstance(found.get("views"), dict):
         raise InputError(f"{path}: expected the record of a dataset")
-    for key in ("format", "version", "scene", "settings", "variant", "versions"):
-        if found.get(key) != record[key]:
-            what = _difference(key, found.get(key), record[key])
-            raise InputError(f"{path}: holds another dataset: {what}")
+    if what := _difference(found, {key: record[key] for key in _SAME}):
+        raise InputError(f"{path}: holds another dataset: {what}")
     views = found["views"]
     return {v.name: views[v.name] for v in plan.views if is_intact(folder, v, views.get(v.name))}
 
 
-def _difference(name: str, found: Any, wanted: Any) -> str:
-    """Where two records first differ."""
+def _difference(found: Any, wanted: Any, name: str = "") -> str | None:
+    """Where a record first differs from what is wanted of it, in words; ``None``: nowhere.
+
+    Of the record itself, what is not wanted does not count.
+    """
     if isinstance(found, dict) and isinstance(wanted, dict):
-        for key in wanted:
-            if found.get(key) != wanted[key]:
-                return _difference(f"{name}.{key}", found.get(key), wanted[key])
+        for key, value in wanted.items():
+            if what := _difference(found.get(key), value, f"{name}.{key}" if name else key):
+                return what
+        if not name:
+            return None
+    if found == wanted:
+        return None
     return f"{name} is {json.dumps(found)}, expected {json.dumps(wanted)}"
 
 
@@ -308,7 +332,7 @@ def _trace_views(
         traced = tracer.trace(missing[0]) if missing else None
         for split in SPLITS:
             if plan.of_split(split):
-                make_folder(folder / split)
+                remove_leftovers(make_folder(folder / split))
         saver = _Saver(folder, plan, record)
         writing: Future[None] | None = None
         with _Progress(len(plan.views), len(record["views"]), show) as progress:
@@ -324,6 +348,11 @@ def _trace_views(
             if writing is not None:
                 writing.result()
                 progress.update()
+    return _finished(folder, plan, record, saver)
+
+
+def _finished(folder: Path, plan: Plan, record: dict[str, Any], saver: _Saver) -> dict[str, Any]:
+    """``record``, and all that describes the views once they are all there."""
     if len(record["views"]) < len(plan.views):
         saver.save()
         return record
@@ -335,6 +364,124 @@ def _trace_views(
     return record
 
 
+# ---- Views by other processes ------------------------------------------------
+
+
+def _hand_out_views(
+    folder: Path,
+    others: Executor,
+    source: bytes,
+    plan: Plan,
+    record: dict[str, Any],
+    show: bool,
+) -> dict[str, Any]:
+    """:func:`_trace_views` by other processes, which write the pictures themselves."""
+    missing = [view for view in plan.views if view.name not in record["views"]]
+    splits = [folder / split for split in SPLITS if plan.of_split(split)]
+    described = {key: record[key] for key in _SAME}
+    with interruptible() as interrupted, permitted(folder) as go:
+        for place in splits:
+            remove_leftovers(make_folder(place))
+        saver = _Saver(folder, plan, record)
+        size = together(others, len(missing))
+        jobs = [
+            Job(_name(views), _make_views, (source, folder.absolute(), go, described, views))
+            for views in (missing[i : i + size] for i in range(0, len(missing), size))
+        ]
+        with _Progress(len(plan.views), len(record["views"]), show) as progress:
+
+            def add(job: Job, entries: list[dict[str, Any]]) -> None:
+                for view, entry in zip(job.arguments[-1], entries, strict=False):
+                    saver.keep(view, entry)
+                    progress.update()
+
+            try:
+                run_jobs(jobs, others, go, add, stop=interrupted)
+            finally:
+                if record["views"]:
+                    saver.save()
+        for place in splits:
+            remove_leftovers(place)  # of workers that died
+    return _finished(folder, plan, record, saver)
+
+
+@contextmanager
+def _crew(
+    folder: Path, source: bytes, workers: int, executor: str | Executor | None
+) -> Iterator[Executor | None]:
+    """Who else traces views, if anybody; a failure before the first view leaves no new folder."""
+    new = not folder.exists() or not any(folder.iterdir())
+    try:
+        first = (_get_ready, (source,))
+        with open_executor(workers, executor, folder=folder, first=first) as others:
+            yield others
+    except Exception:
+        record = folder / RECORD
+        alone = executor is None and workers == 0
+        if new and not alone and record.exists() and not read_json(record, "a record")["views"]:
+            record.unlink()
+            for split in SPLITS:
+                shutil.rmtree(folder / split, ignore_errors=True)
+            with suppress(OSError):  # there may be what somebody else has put there
+                folder.rmdir()
+        raise
+
+
+def _source(
+    scene: str | Path, variant: str, options: Options, parameters: Mapping[str, str] | None
+) -> bytes:
+    """All from which another process prepares the views, as one value that can be compared."""
+    return pickle.dumps((Path(scene).absolute(), dict(parameters or {}), variant, options))
+
+
+@lru_cache(maxsize=1)
+def _prepared(source: bytes) -> tuple[Tracer, Plan, dict[str, Any]]:
+    """A scene, loaded once for many views, its plan, and what the record says of it."""
+    scene, parameters, variant, options = pickle.loads(source)
+    with _quiet():
+        file = SceneFile(scene, parameters)
+        tracer, plan = prepare(file, options)
+    return tracer, plan, json.loads(json.dumps(_describe(file, plan, variant)))
+
+
+def _get_ready(source: bytes) -> None:
+    """Where a worker begins: the scene is loaded while others still look at it."""
+    with using_variant(pickle.loads(source)[2]):
+        _prepared(source)
+
+
+def _name(views: Sequence[View]) -> str:
+    """Of a job, in messages."""
+    if len(views) == 1:
+        return f"view {views[0].name}"
+    return f"views {views[0].name} to {views[-1].name}"
+
+
+def _make_views(
+    source: bytes, folder: Path, go: Permit, described: dict[str, Any], views: Sequence[View]
+) -> list[dict[str, Any]]:
+    """The job of a worker: traces views, writes their pictures; returns entries of the record.
+
+    If the permit is withdrawn, these are the entries of the first views.
+
+    Raises:
+        InputError: if this machine sees another folder, another scene or other versions.
+    """
+    go.require()
+    may_go_on, entries = go.watched(), []
+    with using_variant(pickle.loads(source)[2]):
+        tracer, plan, found = _prepared(source)
+        if _difference(found, described):  # the scene may have been changed since it was loaded
+            _prepared.cache_clear()
+            tracer, plan, found = _prepared(source)
+        if what := _difference(found, described):
+            raise InputError(f"{folder}: the worker on {platform.node()} differs: {what}")
+        for view in views:
+            if may_go_on():
+                entries.append(write_view(folder, view, tracer.trace(view), plan))
+    return entries
+
+
 class _Saver:
     """Writes views, and now and then the record of those that are there."""
 
@@ -343,7 +490,10 @@ class _Saver:
         self.save()
 
     def add(self, view: View, traced: Any) -> None:
-        self._record["views"][view.name] = write_view(self._folder, view, traced, self._plan)
+        self.keep(view, write_view(self._folder, view, traced, self._plan))
+
+    def keep(self, view: View, entry: dict[str, Any]) -> None:
+        self._record["views"][view.name] = entry
         if time.monotonic() - self._saved > _SECONDS_BETWEEN_SAVES:
             self.save()
 

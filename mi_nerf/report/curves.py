@@ -5,6 +5,8 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +17,9 @@ from ..base.errors import InputError, Option
 from ..base.files import read_json, write_text
 from ..base.machine import machine
 from ..data import load_dataset, split_to_measure
+from ..jobs import Permit
 from ..tasks.evaluate import evaluate
-from ..tasks.series import all_trained, mean, trained
+from ..tasks.series import Series, all_trained, mean, trained
 from ..tasks.target import Target
 from ..training.config import TrainConfig, setting_names, to_json, with_settings
 from ..training.presets import preset
@@ -70,6 +73,8 @@ def training_curves(
     looks: int = 8,
     given: Sequence[str] = (),
     on_run: Callable[[str, int], object] | None = None,
+    workers: int = 0,
+    executor: str | Executor | None = None,
 ) -> Record:
     """Trains every row with every seed, and measures held-out views from time to time.
 
@@ -84,7 +89,9 @@ def training_curves(
         looks: how often in each training, at shares of its budget from 1/16 to 1 that grow
             by a constant factor.
         given: names of settings that preset ``auto`` must not choose.
-        on_run: called with the name and the seed before each training.
+        on_run: called with the name and the seed before each training, or after it by workers.
+        workers, executor: who trains, as in :func:`mi_nerf.jobs.open_executor`; this process by
+            default. What the clock shows is that of a machine with several trainings then.
 
     Returns:
         What ``out/report.json`` holds: ``rows``, each with ``name``, ``curve`` (means of the
@@ -108,16 +115,39 @@ def training_curves(
     }
     record = {"settings": settings, "machine": machine(variant), "complete": False, "rows": []}
 
-    def train(name: str, config: TrainConfig) -> Record | None:
-        if on_run is not None:
-            on_run(name, config.seed)
-        place = folder / "runs" / _slug(name) / f"seed_{config.seed}"
-        watch = Watch(place, looks, lambda run: _look(run, split, views))
-        result = trained(data, place, config, variant, _ending, given=given, after_step=watch)
-        return result and {**result, "seed": config.seed, "curve": read_curve(place)}
+    look = partial(_look, split=split, views=views)
+    train = partial(
+        _train,
+        data=str(settings["data"]),
+        folder=folder.absolute(),
+        variant=variant,
+        looks=looks,
+        look=look,
+        given=tuple(given),
+    )
+    series, file = Series(rows, seeds, workers, executor), folder / RECORD
+    return all_trained(record, series, train, summary, file, "a report on trainings", on_run)
 
-    file = folder / RECORD
-    return all_trained(record, rows, seeds, train, summary, file, "a report on trainings")
+
+def _train(
+    name: str,
+    config: TrainConfig,
+    permit: Permit | None,
+    *,
+    data: str,
+    folder: Path,
+    variant: str,
+    looks: int,
+    look: Callable[[Run], Record],
+    given: Sequence[str],
+) -> Record | None:
+    """The result of one row with one seed; ``None`` if interrupted."""
+    place = folder / "runs" / _slug(name) / f"seed_{config.seed}"
+    watch = Watch(place, looks, look)
+    result = trained(
+        data, place, config, variant, _ending, given=given, after_step=watch, permit=permit
+    )
+    return result and {**result, "seed": config.seed, "curve": read_curve(place)}
 
 
 class Watch:

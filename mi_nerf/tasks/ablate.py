@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -11,10 +12,11 @@ from typing import Any, NamedTuple
 from ..base.errors import InputError
 from ..base.files import write_text
 from ..fields.fourier import FourierEncoding
+from ..jobs import Permit
 from ..training.config import TrainConfig, to_json
 from ..training.run import Run
 from .evaluate import evaluate
-from .series import all_trained, mean, trained
+from .series import Series, all_trained, mean, trained
 from .tables import markdown_table, number, save_figure, spread
 
 RECORD, TABLE, FIGURE = "ablation.json", "ablation.md", "ablation.png"
@@ -106,18 +108,23 @@ def ablate(
     seeds: int = 1,
     split: str = "test",
     views: int | None = None,
+    workers: int = 0,
+    executor: str | Executor | None = None,
 ) -> dict[str, Any]:
     """Trains and evaluates every row with every seed; goes on where it was interrupted.
 
     Args:
         config: scale and budget of all rows; :func:`complete` makes the last row of it.
         split, views: what the rows are evaluated on.
+        workers, executor: who trains, as in :func:`mi_nerf.jobs.open_executor`; this process by
+            default. Budgets in seconds buy fewer steps where runs share a machine.
 
     Returns:
         What ``ablation.json`` holds; its ``complete`` is false after Ctrl-C.
 
     Raises:
         InputError: if a row is unknown, or the folder holds another ablation.
+        JobError: if the process of a run dies again and again.
     """
     for name in rows:
         if name not in _ALL:
@@ -131,17 +138,38 @@ def ablate(
     settings["base"] = to_json(base)
     record: dict[str, Any] = {"settings": settings, "complete": False, "rows": []}
 
-    def train(name: str, config: TrainConfig) -> dict[str, Any] | None:
-        print(f"{name}, seed {config.seed}", flush=True)
-        measure = partial(_quality, settings=settings, variant=variant)
-        return trained(data, folder / name / f"seed_{config.seed}", config, variant, measure)
-
     configs = {name: _ALL[name].change(base) for name in rows}
-    all_trained(record, configs, seeds, train, _summary, folder / RECORD, "an ablation")
+    place = folder.absolute()
+    train = partial(_train, data=settings["data"], folder=place, settings=settings, variant=variant)
+    all_trained(
+        record,
+        Series(configs, seeds, workers, executor),
+        train,
+        _summary,
+        folder / RECORD,
+        "an ablation",
+        on_run=lambda name, seed: print(f"{name}, seed {seed}", flush=True),
+    )
     write_text(folder / TABLE, table(record).splitlines())
     if any(row["psnr"] is not None for row in record["rows"]):
         _draw(folder / FIGURE, record)
     return record
+
+
+def _train(
+    name: str,
+    config: TrainConfig,
+    permit: Permit | None,
+    *,
+    data: str | Path,
+    folder: Path,
+    settings: dict[str, Any],
+    variant: str,
+) -> dict[str, Any] | None:
+    """The result of one row with one seed; ``None`` if interrupted."""
+    measure = partial(_quality, settings=settings, variant=variant)
+    place = folder / name / f"seed_{config.seed}"
+    return trained(data, place, config, variant, measure, permit=permit)
 
 
 def _quality(run: Run, settings: dict[str, Any], variant: str) -> dict[str, Any]:

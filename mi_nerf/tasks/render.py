@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import imageio.v2 as imageio
 import numpy as np
@@ -27,6 +27,7 @@ from ..scene_xml.refusals import refused_rendering
 from ..scene_xml.scene_file import SceneFile
 from .target import Target, open_target
 
+T = TypeVar("T")
 Path_ = Literal["orbit", "spiral", "test"]
 Frames = Generator[tuple[str, Image], None, None]  # name and (H, W, 4) linear premultiplied RGBA
 
@@ -46,6 +47,7 @@ def frames_of(
     still: bool = False,
     size: tuple[int, int] | None = None,
     spp: int | None = None,
+    only: range | None = None,
 ) -> tuple[int, Frames]:
     """Renders a run along a camera path, or a Mitsuba XML scene.
 
@@ -54,9 +56,10 @@ def frames_of(
         frames: along the path; default: 60, or all test views; with ``still``, one.
         size: width and height; default: those of the run's images or the scene's film.
         spp: samples a pixel; default: 1 for runs, the scene's own for XML.
+        only: numbers of the frames to render; default: all.
 
     Returns:
-        The number of frames and an iterator over them.
+        The number of frames in all and an iterator over those that are rendered.
 
     Raises:
         InputError: if there is neither, or what was asked for does not suit it.
@@ -79,11 +82,14 @@ def frames_of(
                 frames=frames or (1 if still else 60),
                 size=size,
                 spp=spp or 0,
+                only=only,
             )
         source = open_target(source)
     path = path or default_path(source)
     usual = 1 if still else (0 if path == "test" else 60)
-    return run_frames(source, variant, path=path, frames=frames or usual, size=size, spp=spp or 1)
+    return run_frames(
+        source, variant, path=path, frames=frames or usual, size=size, spp=spp or 1, only=only
+    )
 
 
 def run_frames(
@@ -94,11 +100,12 @@ def run_frames(
     frames: int = 1,
     size: tuple[int, int] | None = None,
     spp: int = 1,
+    only: range | None = None,
 ) -> tuple[int, Frames]:
     """Renders a run along a camera path.
 
     Returns:
-        The number of frames and an iterator over them.
+        The number of frames in all and an iterator over those that are rendered.
 
     Raises:
         InputError: if the run's dataset cannot be read.
@@ -113,7 +120,7 @@ def run_frames(
     space = marched.field.color_space
 
     def generate() -> Frames:
-        for i, pose in enumerate(poses):
+        for i, pose in _chosen(poses, only):
             view = render_view(marched, intrinsics, pose, backend, spp=spp)
             yield f"{path}_{i:03d}", _linear_rgba(view.color, view.opacity, space)
 
@@ -128,6 +135,7 @@ def scene_frames(
     frames: int = 1,
     size: tuple[int, int] | None = None,
     spp: int = 0,
+    only: range | None = None,
 ) -> tuple[int, Frames]:
     """Renders a Mitsuba scene: all of its sensors, or the first one moved along a path.
 
@@ -172,11 +180,11 @@ def scene_frames(
             if path is not None:
                 draw = partial(render, scene, spp or sensors[0].sampler().sample_count())
                 yield frames
-                yield from _moving(scene, sensors[0], path, frames, draw)
+                yield from _moving(scene, sensors[0], path, frames, draw, only)
                 return
             yield len(sensors)
-            counts = [spp or sensor.sampler().sample_count() for sensor in sensors]
-            for i, (sensor, count) in enumerate(zip(sensors, counts, strict=True)):
+            for i, sensor in _chosen(sensors, only):
+                count = spp or sensor.sampler().sample_count()
                 yield f"sensor_{i:03d}", render(scene, count, sensor)
 
     produced = produce()
@@ -350,8 +358,18 @@ def _rgba(image: Any, film: Any) -> Image:
     return np.concatenate([np.broadcast_to(color, (*color.shape[:2], 3)), alpha], axis=-1)
 
 
+def _chosen(items: Iterable[T], only: range | None) -> list[tuple[int, T]]:
+    """Those of some items whose numbers are wanted, with these."""
+    return [pair for pair in enumerate(items) if only is None or pair[0] in only]
+
+
 def _moving(
-    scene: Any, sensor: Any, path: Path_, frames: int, render: Callable[[Any, int], Image]
+    scene: Any,
+    sensor: Any,
+    path: Path_,
+    frames: int,
+    render: Callable[[Any, int], Image],
+    only: range | None,
 ) -> Frames:
     """Moves a sensor around the scene's box, at its own distance and height."""
     import mitsuba as mi
@@ -361,7 +379,7 @@ def _moving(
     center = np.array(scene.bbox().center(), np.float64).ravel()
     aimed = _aim(start, center)
     poses = (orbit_like if path == "orbit" else spiral_like)(aimed, frames)
-    for i, pose in enumerate(poses):
+    for i, pose in _chosen(poses, only):
         matrix = mi.ScalarTransform4f(mitsuba_from_opengl(pose))
         parameters["to_world"] = mi.Transform4f(matrix)
         parameters.update()

@@ -19,6 +19,7 @@ from mi_nerf.base.files import (
     check_folder,
     make_folder,
     read_json,
+    remove_leftovers,
     replacing,
     write_json,
 )
@@ -100,6 +101,21 @@ def test_content_reaches_the_disk_before_its_name(
     with replacing(tmp_path / "a") as temporary:
         temporary.write_text("x")
     assert calls == ["file synced, 0 named", "renamed", "folder synced, 1 named"]
+
+
+def test_what_killed_processes_leave_is_removed(tmp_path: Path) -> None:
+    for name in ("r_0.png", "a.b-c.safetensors", "plain"):
+        with replacing(tmp_path / name) as temporary:  # whatever its name is like
+            left = temporary
+            copy = tmp_path / f"copy of {name}"
+            copy.write_text("")
+        copy.rename(left)
+    others = {".hidden", ".hidden.png", ".cache-123.png", "r_0-0123456789abcdef.png"}
+    for name in others:
+        (tmp_path / name).touch()
+    assert len(names(tmp_path)) == 10
+    remove_leftovers(tmp_path)
+    assert names(tmp_path) == others | {"r_0.png", "a.b-c.safetensors", "plain"}
 
 
 def test_a_folder_is_not_replaced(tmp_path: Path) -> None:

@@ -2,18 +2,21 @@
 
     python -m tests.benchmarks.generate
     python -m tests.benchmarks.generate --scene bonsai --size 200 --views 8
+    python -m tests.benchmarks.generate --workers 2
 
 In turns, several times: the whole command ``mi-nerf generate`` and a process that loads
 the same scene, moves one sensor and calls ``mi.render`` for the same views, samples and
 pixels, and does nothing with the images. Then, in this process: the kernels that
 ``generate`` compiles after its first view, starting from an empty cache if HOME is an empty
 folder; and its estimate of the ground-truth noise against renderings of 16 times as many
-samples.
+samples. With ``--workers N`` only this: the command with one worker and with N, and without any,
+in turns, whose files must be the same.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import subprocess
 import sys
 import tempfile
@@ -68,16 +71,20 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=64)
     parser.add_argument("--views", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--workers", type=int, default=0, help="processes to compare with one")
     parser.add_argument("--variant")
     add_options(parser)
     options = parser.parse_args()
     variant = choose_variant(options.variant)
     print(f"{machine()}, {variant}, mi_nerf {mi_nerf.__version__}")
     print(f"{options.scene}, {options.views} views of {options.size}^2, {options.spp} spp")
-    rows = [_kernels(options, variant)]  # first: what follows fills the kernel cache
-    if options.repeats:
-        rows.append(_speed(options, variant))
-    rows.append(_noise(options, variant))
+    if options.workers:
+        rows = [_workers(options, variant)]
+    else:
+        rows = [_kernels(options, variant)]  # first: what follows fills the kernel cache
+        if options.repeats:
+            rows.append(_speed(options, variant))
+        rows.append(_noise(options, variant))
     save("generate", rows, options, variant, GENERATION)
 
 
@@ -91,10 +98,7 @@ def _speed(options: argparse.Namespace, variant: str) -> Row:
     seconds: dict[str, list[float]] = {"generate": [], "bare loop": []}
     for _ in range(options.repeats):
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, "-m", "mi_nerf.cli", "generate", str(path), folder]
-            command += ["--train", views, "--val", "0", "--test", "0", "--size", size, size]
-            command += ["--spp", spp, "--cameras", "hemisphere", "--variant", variant]
-            seconds["generate"].append(_timed(command))
+            seconds["generate"].append(_timed(_command(options, variant, folder)))
         command = [sys.executable, "-c", _BARE_LOOP, variant, str(path), size, views, spp]
         seconds["bare loop"].append(_timed(command))
     for name, values in seconds.items():
@@ -110,6 +114,52 @@ def _speed(options: argparse.Namespace, variant: str) -> Row:
     return Row(
         {"what": f"{what} views of {_of_scene(options)}"}, {**figures, "times": Figure(ratio)}
     )
+
+
+def _command(options: argparse.Namespace, variant: str, folder: str) -> list[str]:
+    """``mi-nerf generate`` as a command line."""
+    size = str(options.size)
+    command = [sys.executable, "-m", "mi_nerf.cli", "generate"]
+    command += [str(find_scene(options.scene)), folder, "--train", str(options.views)]
+    command += ["--val", "0", "--test", "0", "--size", size, size, "--spp", str(options.spp)]
+    return [*command, "--cameras", "hemisphere", "--variant", variant]
+
+
+def _workers(options: argparse.Namespace, variant: str) -> Row:
+    """The whole command with so many workers, one of them or none, and whether files agree."""
+    counts = (0, 1, options.workers)
+    seconds: dict[int, list[float]] = {count: [] for count in counts}
+    digests = set()
+    for _ in range(options.repeats):
+        for count in counts:
+            with tempfile.TemporaryDirectory() as folder:
+                command = [*_command(options, variant, folder), "--workers", str(count)]
+                seconds[count].append(_timed(command))
+                digests.add(_digest(Path(folder)))
+    if len(digests) != 1:
+        raise SystemExit("files depend on the number of workers, or on chance")
+    names = {0: "no worker", 1: "1 worker", options.workers: f"{options.workers} workers"}
+    for count, values in seconds.items():
+        print(f"{names[count]}: {', '.join(f'{v:.1f}' for v in values)} s in all")
+    figures = {names[count]: median_of(values, "s") for count, values in seconds.items()}
+    times = {
+        f"times as fast as {names[count]}": Figure(
+            float(np.median(seconds[count]) / np.median(seconds[options.workers]))
+        )
+        for count in (0, 1)
+    }
+    print(", ".join(f"{figure.value:.3f} {name}" for name, figure in times.items()))
+    what = f"mi-nerf generate, the whole command: {options.views} views of {_of_scene(options)}"
+    return Row({"what": f"{what}; the same bytes"}, {**figures, **times})
+
+
+def _digest(folder: Path) -> str:
+    """Of the names and contents of all files in a folder."""
+    total = hashlib.sha256()
+    for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+        total.update(f"{path.relative_to(folder)} {path.stat().st_size} ".encode())
+        total.update(path.read_bytes())
+    return total.hexdigest()
 
 
 def _timed(command: list[str]) -> float:
