@@ -132,12 +132,12 @@ def pass_on(reply: bytes, future: Future[Any]) -> None:
     """Tells those who wait for a job what :func:`outcome` says of it."""
     try:
         good, result = pickle.loads(reply)
-    except Exception as error:  # of a kind that is not known here
-        good, result = False, (error, "")
+    except Exception as unknown:  # of a kind that is not known here
+        future.set_exception(unknown)
+        return
     if good:
         future.set_result(result)
         return
     error, text = result
-    if text:
-        error.__cause__ = RemoteError(text)
+    error.__cause__ = RemoteError(text)
     future.set_exception(error)
