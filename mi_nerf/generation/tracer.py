@@ -20,7 +20,7 @@ from .noise import Samples
 from .passes import Tile, fits, passes, sets, tiles
 from .plan import Plan, View
 from .surfaces import trace_surfaces
-from .wrapped import choosing, coverage_integrator, guarded
+from .wrapped import LARGEST, choosing, coverage_integrator, guarded
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ class Tracer:
                     f"expected RGBA and its own {self._channels - 4}"
                 )
             image = image[..., :4]  # what follows are AOVs
-            if np.isfinite(image).all():
+            if np.abs(image).max() * spp < LARGEST:  # so is every sample; not if any is NaN
                 return image, spp
         if not self._can_guard:
             return self._one_by_one(camera, spp, seed)

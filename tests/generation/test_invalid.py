@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -156,35 +155,28 @@ def test_other_pixels_do_not_change(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_too_many(tmp_path: Path, refused: Callable[..., str]) -> None:
+def test_too_many(tmp_path: Path) -> None:
     scene = square(tmp_path / "s", texture_of(0.2, np.nan))
-    arguments = ["--train", "1", "--val", "0", "--test", "0", "--size", "24", "24", "--spp", "8"]
-    line = refused("generate", scene, tmp_path / "out", *arguments)
-    assert "view train/r_0: " in line and "% of its samples are NaN or infinite" in line
+    with pytest.raises(InputError, match=r"view train/r_0: \d+\.\d% of its samples are NaN or inf"):
+        make(scene, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow
-def test_paths_from_the_light(tmp_path: Path) -> None:
-    """A particle tracer's bad splats, found sample by sample."""
-    lamp = '<emitter type="point"><point name="position" x="0" y="0" z="3"/></emitter>'
-    scenes = [
-        square(tmp_path / name, texture_of(1 / 200, bad), "ptracer", lamp)
-        for name, bad in (("bad", np.nan), ("good", 0.5))
-    ]
-    for scene in scenes:  # a point of light alone
-        text = scene.read_text()
-        start = text.index('<emitter type="constant"')
-        scene.write_text(text[:start] + text[text.index("<shape", start) :])
-    few = Options(train=1, val=0, test=0, size=(24, 20), spp=24)
-    records = [make(s, tmp_path / f"{s.parent.name}_out", few) for s in scenes]
-    for name in records[0]["views"]:
-        bad, good = (exr(tmp_path / f"{s.parent.name}_out/{name}.exr") for s in scenes)
-        assert records[0]["views"][name]["invalid_samples"] > 0
-        assert records[1]["views"][name]["invalid_samples"] == 0
-        assert np.isfinite(bad).all()
-        assert bad[..., 3] == pytest.approx(good[..., 3])
-        assert bad[..., :3].sum() == pytest.approx(good[..., :3].sum(), rel=0.25)
+def test_integrators_without_single_rays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Sample by sample, if nothing else is known of an integrator: as many bad ones."""
+    scene = square(tmp_path / "s", texture_of(1 / 300, np.nan))
+    ray_by_ray = make(scene, tmp_path / "a")
+    monkeypatch.setattr("mi_nerf.generation.tracer.samples_rays", lambda integrator: False)
+    sample_by_sample = make(scene, tmp_path / "b")
+    for name, view in ray_by_ray["views"].items():
+        a, b = (exr(tmp_path / f"{folder}/{name}.exr") for folder in "ab")
+        assert np.isfinite(b).all()
+        counts = view["invalid_samples"], sample_by_sample["views"][name]["invalid_samples"]
+        assert counts[1] == pytest.approx(counts[0], abs=6 * counts[0] ** 0.5)
+        assert b.mean((0, 1)) == pytest.approx(a.mean((0, 1)), rel=0.02)
 
 
 @pytest.mark.slow
