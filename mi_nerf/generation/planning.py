@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import InputError, Option
-from ..scene_xml.parts import Part, read_parts
+from ..scene_xml.parts import Part, box_of, read_parts
 from ..scene_xml.scene_file import Bounds, SceneFile
 from ..scene_xml.sensors import named_ups
 from .choosing import Choice, Situation, choose, protocol_name
@@ -41,7 +41,7 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
     spp = _samples(file, scene, options)
     sensors = read_sensors(scene) if file.plugins("Sensor") else []
     parts = read_parts(file)
-    box = _with_merged(box, parts)
+    box = _together(box, box_of(parts))
     if options.up is None:
         up, why = vertical(sensors, named_ups(file), parts)
     else:
@@ -73,12 +73,11 @@ def make_plan(file: SceneFile, scene: Any, box: Bounds, options: Options) -> Pla
     )
 
 
-def _with_merged(box: Bounds, parts: Sequence[Part]) -> Bounds:
-    """The box of all that is visible: Mitsuba forgets that of rectangles merged with meshes."""
-    visible = [part for part in parts if not part.glows]
-    lower = np.min([np.array(box[0]), *(part.lower for part in visible)], axis=0)
-    upper = np.max([np.array(box[1]), *(part.upper for part in visible)], axis=0)
-    return _triple(lower), _triple(upper)
+def _together(a: Bounds, b: Bounds | None) -> Bounds:
+    """The box around two."""
+    if b is None:
+        return a
+    return _triple(np.minimum(a[0], b[0])), _triple(np.maximum(a[1], b[1]))
 
 
 def _subject(

@@ -19,6 +19,7 @@ from ..base.interrupts import interruptible
 from ..base.machine import versions
 from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
+from ..scene_xml.parts import box_of, read_parts
 from ..scene_xml.scene_file import Bounds, SceneFile, visible_bounds
 from ..scene_xml.sensors import separate_sensors
 from .output import is_intact, write_forward_capture, write_transforms, write_view
@@ -205,7 +206,7 @@ def _load(file: SceneFile, hide_emitters: bool) -> tuple[list[str], Any, Bounds]
     media = (shape.interior_medium() for shape in scene.shapes())
     if not scene.emitters() and not any(hasattr(medium, "field") for medium in media):
         raise InputError(f"{file.path}: has no emitter, all images would be black")
-    box = visible_bounds(scene)
+    box = visible_bounds(scene) or box_of(read_parts(file))
     if box is None or not np.ptp(np.array(box), axis=0).any():
         raise InputError(f"{file.path}: its box is empty, expected shapes that can be seen")
     return notes, scene, box
