@@ -62,11 +62,10 @@ def test_a_large_floor_changes_nothing_about_the_cameras(tmp_path: Path) -> None
     assert (places(plan) == places(alone)).all() and plan.radius == 4
     assert "object: ball, box; not floor, up to 667 times as large" in said(plan)
     assert plan.record()["surroundings"] == ["floor"]
-    assert np.array(plan.box) == pytest.approx(
-        np.array([[-500, -500, -0.6], [500, 500, 0.7]]), rel=1e-5
-    )
+    whole, near = [[-500, -500, -0.6], [500, 500, 0.7]], [[-4, -4, -0.6], [4, 4, 0.7]]
+    assert np.array(plan.box) == pytest.approx(np.array(whole), rel=1e-5)
     # What a field should hold is what is near the cameras.
-    assert np.array(plan.region) == pytest.approx(np.array([[-4, -4, -0.6], [4, 4, 0.7]]), rel=1e-5)
+    assert np.array(plan.region) == pytest.approx(np.array(near), rel=1e-5)
     assert 0.1 < plan.survey.coverage < 0.2
     assert plan.clips[0] < 0.1 and plan.clips[1] > 1e5
 
@@ -290,7 +289,7 @@ def test_more_than_there_are(tmp_path: Path) -> None:
     for options in ({"train": 4}, {"test": 3}, {"train": 2, "test": 2}, {"train": 0}):
         with pytest.raises(InputError, match="the scene has 3 sensors"):
             plan_of(path, cameras="scene", **options)
-    with pytest.raises(InputError, match="center=.*: has no meaning for the scene's own sensors"):
+    with pytest.raises(InputError, match="center: has no meaning for the scene's own sensors"):
         plan_of(path, cameras="scene", center=(0, 0, 0))
     nothing = write_scene(tmp_path, BALL, SKY)
     with pytest.raises(InputError, match="has no sensor that is a camera, expected one of persp"):
