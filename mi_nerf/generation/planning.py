@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..base.errors import InputError, Option
-from ..scene_xml.parts import Part, read_parts
+from ..scene_xml.parts import Part, box_of, read_parts
 from ..scene_xml.scene_file import Bounds, SceneFile
 from ..scene_xml.sensors import named_ups
 from .choosing import Choice, Situation, choose, protocol_name
@@ -20,7 +20,7 @@ from .sensors import SensorCamera, read_sensors
 from .subject import Subject, find_subject, told_subject
 from .upright import told_up, vertical
 
-__all__ = ["make_plan", "protocol_name"]
+__all__ = ["make_plan", "protocol_name", "with_kept"]
 
 Array = np.ndarray[Any, Any]
 
@@ -45,8 +45,8 @@ def make_plan(
     protocol_name(file, options)  # is known
     spp = _samples(file, scene, options)
     sensors = read_sensors(scene) if file.plugins("Sensor") else []
-    parts = _with_kept(read_parts(file), scene, hidden)
-    box = _with_merged(box, parts)
+    parts = with_kept(read_parts(file), scene, hidden)
+    box = _together(box, box_of(parts))
     if options.up is None:
         up, why = vertical(sensors, named_ups(file), parts)
     else:
@@ -80,7 +80,7 @@ def make_plan(
     )
 
 
-def _with_kept(parts: Sequence[Part], scene: Any, hidden: Hidden | None) -> list[Part]:
+def with_kept(parts: Sequence[Part], scene: Any, hidden: Hidden | None) -> list[Part]:
     """The parts, of which light sources that are seen are like others."""
     if hidden is None or not hidden.chosen:
         return list(parts)
@@ -88,12 +88,11 @@ def _with_kept(parts: Sequence[Part], scene: Any, hidden: Hidden | None) -> list
     return [replace(part, glows=part.glows and part.name not in kept) for part in parts]
 
 
-def _with_merged(box: Bounds, parts: Sequence[Part]) -> Bounds:
-    """The box of all that is visible: Mitsuba forgets that of rectangles merged with meshes."""
-    visible = [part for part in parts if not part.glows]
-    lower = np.min([np.array(box[0]), *(part.lower for part in visible)], axis=0)
-    upper = np.max([np.array(box[1]), *(part.upper for part in visible)], axis=0)
-    return _triple(lower), _triple(upper)
+def _together(a: Bounds, b: Bounds | None) -> Bounds:
+    """The box around two."""
+    if b is None:
+        return a
+    return _triple(np.minimum(a[0], b[0])), _triple(np.maximum(a[1], b[1]))
 
 
 def _subject(

@@ -24,6 +24,7 @@ from ..base.machine import versions
 from ..base.progress_bar import bars_are_seen, progress_bar
 from ..base.variants import using_variant
 from ..jobs import Job, Permit, open_executor, permitted, run_jobs, together
+from ..scene_xml.parts import box_of, read_parts
 from ..scene_xml.scene_file import Bounds, SceneFile, visible_bounds
 from ..scene_xml.scene_file import quiet as _quiet
 from ..scene_xml.sensors import separate_sensors
@@ -34,7 +35,7 @@ from .notes import memory_line, notes
 from .output import is_intact, write_forward_capture, write_transforms, write_view
 from .plan import Plan, View
 from .plan_picture import PICTURE, draw
-from .planning import make_plan, protocol_name
+from .planning import make_plan, protocol_name, with_kept
 from .protocol import SPLITS, Options
 from .tracer import Tracer
 
@@ -242,6 +243,7 @@ def _load(file: SceneFile, options: Options, hide: bool) -> _Loaded:
         raise InputError(f"{file.path}: has no emitter, all images would be black")
     hidden = Hidden(scene, hide, options.keep_emitters)
     box = visible_bounds(scene, hidden.keeps)
+    box = box or box_of(with_kept(read_parts(file), scene, hidden))
     if box is None or not np.ptp(np.array(box), axis=0).any():
         if hidden.any and visible_bounds(scene, lambda shape: True) is not None:
             raise InputError(

@@ -98,10 +98,10 @@ def around(
 
 
 def _center_and_radius(box: Bounds, options: Options) -> tuple[Array, float]:
-    """The origin and 4, as in the paper, for objects in [−1, 1]³; the same proportions else."""
+    """The origin and 4, as in the paper, for what lies in [−1, 1]³; the same proportions else."""
     corners = np.array(box)
     extent = float(np.ptp(corners, axis=0).max())
-    fits = np.abs(corners).max() <= _UNIT_BOX and extent >= _SMALLEST
+    fits = np.abs(corners).max() <= _UNIT_BOX and extent >= _SMALLEST and options.object is None
     center = np.zeros(3) if fits else corners.mean(axis=0)
     if options.center is not None:
         center = np.array(options.center)

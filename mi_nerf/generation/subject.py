@@ -24,7 +24,7 @@ is three balls.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -104,8 +104,8 @@ def told_subject(parts: Sequence[Part], names: Sequence[str]) -> Subject:
                 _listed(tuple(known), _LISTED),
             )
         chosen += [part for part in found if part not in chosen]
-    others = tuple(p for p in parts if p not in chosen and not p.glows)
-    return Subject(_bounds(chosen), tuple(p.name for p in chosen), others, told=True)
+    others = [part for part in parts if part not in chosen and not part.glows]
+    return _subject(chosen, others, told=True)
 
 
 def find_subject(parts: Sequence[Part], whole: Bounds, sensor: SensorCamera | None) -> Subject:
@@ -127,7 +127,16 @@ def find_subject(parts: Sequence[Part], whole: Bounds, sensor: SensorCamera | No
         rest, others = _apart(mesh, rest, others, sensor)
     if not others:
         return Subject(whole)
-    return Subject(_bounds(rest), tuple(part.name for part in rest), tuple(others))
+    return _subject(rest, others)
+
+
+def _subject(chosen: Sequence[Part], others: Sequence[Part], told: bool = False) -> Subject:
+    """A subject that keeps no geometry."""
+    names = tuple(part.name for part in chosen)
+    bare = tuple(replace(part, shape=None) for part in others)
+    corners = [part.lower for part in chosen], [part.upper for part in chosen]
+    lower, upper = np.min(corners[0], axis=0).tolist(), np.max(corners[1], axis=0).tolist()
+    return Subject((tuple(lower), tuple(upper)), names, bare, told)
 
 
 def _apart(
@@ -199,12 +208,6 @@ def _union(parts: Sequence[Part], name: str) -> Part:
     lower = np.min([part.lower for part in parts], axis=0)
     upper = np.max([part.upper for part in parts], axis=0)
     return Part(name, lower, upper, False, None, (0.0, 0.0))
-
-
-def _bounds(parts: Sequence[Part]) -> Bounds:
-    lower = np.min([part.lower for part in parts], axis=0)
-    upper = np.max([part.upper for part in parts], axis=0)
-    return tuple(lower.tolist()), tuple(upper.tolist())
 
 
 def _listed(names: Sequence[str], most: int = _MENTIONED) -> str:

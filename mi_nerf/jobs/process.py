@@ -138,6 +138,6 @@ def pass_on(reply: bytes, future: Future[Any]) -> None:
     if good:
         future.set_result(result)
         return
-    error, text = result
-    error.__cause__ = RemoteError(text)
-    future.set_exception(error)
+    failure, text = result
+    failure.__cause__ = RemoteError(text)
+    future.set_exception(failure)

@@ -7,12 +7,13 @@ names of its parts. Here their geometry alone is loaded, apart.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from .scene_file import SceneFile
+from .scene_file import Bounds, SceneFile
 
 Array = np.ndarray[Any, Any]
 
@@ -71,6 +72,19 @@ def read_parts(file: SceneFile) -> list[Part]:
             part = Part(name, lower, upper, shape.id() in glowing, None, (0.0, 0.0), shape)
             parts.append(_with_plane(part))
     return parts
+
+
+def box_of(parts: Sequence[Part]) -> Bounds | None:
+    """The box of all shapes that are no light sources; None without any.
+
+    That of a loaded scene may be less: Mitsuba forgets rectangles that it merges with meshes.
+    """
+    visible = [part for part in parts if not part.glows]
+    if not visible:
+        return None
+    lower = np.min([part.lower for part in visible], axis=0)
+    upper = np.max([part.upper for part in visible], axis=0)
+    return tuple(lower.tolist()), tuple(upper.tolist())
 
 
 def pieces(part: Part) -> list[Part]:

@@ -96,7 +96,7 @@ def test_names_boxes_and_lamps(scene: Path) -> None:
 def test_planes(scene: Path) -> None:
     parts = parts_of(scene)
     flat = {name for name, part in parts.items() if part.normal is not None}
-    assert flat == {"slab", "rectangle 1", "lamp", "cylinder 1", "mesh"}
+    assert flat == {"slab", "rectangle 1", "lamp", "cylinder 1"}
     sine, cosine = np.sin(np.radians([30, 40])), np.cos(np.radians([30, 40]))
     slab, rectangle = parts["slab"], parts["rectangle 1"]
     assert np.abs(slab.normal @ [0, -sine[0], cosine[0]]) == pytest.approx(1)
