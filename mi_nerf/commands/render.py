@@ -10,6 +10,7 @@ from tyro.conf import Positional, arg
 
 from ..base.checks import valid_size
 from ..base.variants import choose_variant
+from ..images.denoise import denoised_frames, denoiser
 from ..scene_xml.library import scenes
 from ..tasks.render import check_output, frames_of, output_kind, write_frames
 from .shared import Variant, positive, progress_bar
@@ -27,7 +28,7 @@ class Render:
 
     mi-nerf render scene.xml -o scene.exr --spp 64
 
-    mi-nerf render table -o table.png
+    mi-nerf render table -o table.png --spp 16 --denoise
     """
 
     target: Positional[Annotated[Path, arg(metavar="TARGET")]]
@@ -43,6 +44,8 @@ class Render:
     """Width and height; default: those of the run's images or the scene's film."""
     spp: int | None = None
     """Samples a pixel; default: 1 for runs, the scene's own for XML."""
+    denoise: bool = False
+    """Take the noise out of the pictures, by Open Image Denoise: pip install 'mi_nerf[denoise]'."""
     variant: Variant = None
 
     def run(self, _started: float) -> None:
@@ -53,6 +56,8 @@ class Render:
         if self.size is not None:
             valid_size(self.size)
         check_output(self.out, self.frames or 1)
+        if self.denoise:
+            denoiser()  # may be missing: said before anything is rendered
         count, images = frames_of(
             self._target(),
             choose_variant(self.variant),
@@ -62,6 +67,7 @@ class Render:
             size=self.size,
             spp=self.spp,
         )
+        images = denoised_frames(images) if self.denoise else images
         with progress_bar("render", "frame", count) as bar:
             write_frames(self.out, count, images, on_frame=bar.update)
         print(f"{self.out}: {count} frame{'s' if count != 1 else ''}")

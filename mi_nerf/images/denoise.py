@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import closing
 from typing import Any
 
 import numpy as np
@@ -44,3 +46,12 @@ def denoised(image: Image, albedo: Image | None = None, normal: Image | None = N
     result = np.array(image, np.float32)
     result[..., :3] = np.maximum(denoiser().denoise(color, hdr=True, **given), 0)
     return result
+
+
+def denoised_frames(
+    frames: Generator[tuple[str, Image], None, None],
+) -> Generator[tuple[str, Image], None, None]:
+    """The same frames, each on its own, without noise."""
+    with closing(frames):
+        for name, image in frames:
+            yield name, denoised(image)
