@@ -6,19 +6,20 @@
 Each scene is rendered with a few samples a pixel and many seeds. Its noise is the variance of a
 pixel's estimate, the mean over pixels and channels; times the seconds of a picture, it is what
 a given error costs, whatever the number of samples. Seconds are those of all threads together,
-the median of pictures that compile nothing; processes of all checkouts take turns. The ratio is
+the median of pictures that compile nothing; processes of all checkouts take turns. ``ratio`` is
 that of this product to that of the other checkout, ``means`` the largest difference of the
 means of rows of pixels, in standard errors.
 
 With ``--meshes``, the same scenes by Mitsuba's ``path``, each field replaced by a mesh of the
 same look: marching cubes through its density, black, with the colour that the field shows along
-the normal as emission. The ratio is then that of ``nerf_path`` to it.
+the normal as emission. ``to_path`` is the ratio to it.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from mi_nerf.base.variants import choose_variant
 from tests.benchmarks import checkout, machine, results
 from tests.benchmarks.results import RENDERING, ROOT, Figure, Row, median_of, save
 
+_MESHES = "path, meshes"
 SCENES = ("table", "mirror", "interlocked")
 RENDER = """
 import time
@@ -43,21 +45,25 @@ if a["threads"]:
 if a["meshes"]:
     from tests.benchmarks.light_transport import with_meshes
 width, height = a["size"]
-scene = mi.load_file(a["scene"], width=width, height=height, spp=a["spp"])
-integrator, sensor = scene.integrator(), scene.sensors()[0]
-if a["meshes"]:
-    scene = with_meshes(scene, a["out"])
-    integrator = mi.load_dict({"type": "path", "max_depth": 8})
-busy, images = [], []
-for seed in range(a["seeds"] + 1):
-    start = time.process_time()
-    image = np.array(
-        mi.render(scene, sensor=sensor, integrator=integrator, spp=a["spp"], seed=seed + a["first"])
-    )
-    busy.append(time.process_time() - start)
-    images.append(image[..., :3])
-np.save(a["out"] + "/images.npy", np.array(images[1:], np.float32))
-answer({"package": mi_nerf.__file__, "busy": busy[1:]})
+busy = {}
+for path in a["scenes"]:
+    name = path.split("/")[-1].removesuffix(".xml")
+    scene = mi.load_file(path, width=width, height=height, spp=a["spp"])
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    if a["meshes"]:
+        scene = with_meshes(scene, a["out"])
+        integrator = mi.load_dict({"type": "path", "max_depth": 8})
+    busy[name], images = [], []
+    for seed in range(a["seeds"] + 1):
+        start = time.process_time()
+        image = mi.render(
+            scene, sensor=sensor, integrator=integrator, spp=a["spp"], seed=seed + a["first"]
+        )
+        images.append(np.array(image)[..., :3])
+        busy[name].append(time.process_time() - start)
+    np.save(f"{a['out']}/{name}.npy", np.array(images[1:], np.float32))
+    busy[name] = busy[name][1:]
+answer({"package": mi_nerf.__file__, "busy": busy})
 """
 
 
@@ -67,9 +73,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=SCENES)
-    parser.add_argument("--size", type=int, nargs=2, default=(128, 64))
+    parser.add_argument("--size", type=int, nargs=2, default=(96, 48))
     parser.add_argument("--spp", type=int, default=16)
-    parser.add_argument("--seeds", type=int, default=4, help="pictures of each process")
+    parser.add_argument("--seeds", type=int, default=5, help="pictures of each process")
     parser.add_argument("--repeats", type=int, default=2, help="processes of each checkout")
     parser.add_argument("--threads", type=int, default=1, help="0: one for each core")
     parser.add_argument("--meshes", action="store_true", help="beside meshes of the same look")
@@ -79,53 +85,35 @@ def main() -> None:
     options = parser.parse_args()
     options.variant = choose_variant(options.variant)
     print(f"{machine()}, {options.size[0]}x{options.size[1]}, {options.spp} samples a pixel")
-    for scene in options.scenes:
-        _compare(scene, options)
-
-
-def _compare(scene: str, options: argparse.Namespace) -> None:
-    """Renders one scene with all checkouts in turns, and saves their rows."""
     versions = checkout.versions(options)
     if options.meshes:
-        versions = {"path, meshes": ROOT, **versions}
-    busy: dict[str, list[float]] = {name: [] for name in versions}
-    images: dict[str, list[np.ndarray[Any, Any]]] = {name: [] for name in versions}
+        versions = {_MESHES: ROOT, **versions}
+    pictures: dict[str, list[Pictures]] = {name: [] for name in versions}
     for turn in range(options.repeats):
         for name, folder in versions.items():
-            seconds, seen = _rendered(folder, scene, turn, name == "path, meshes", options)
-            busy[name] += seconds
-            images[name] += [*seen]
-    costs: dict[str, float] = {}
-    for name, folder in versions.items():
-        seen = np.array(images[name], np.float64)
-        variance = float(seen.var(axis=0, ddof=1).mean())
-        costs[name] = variance * float(np.median(busy[name]))
-        figures = {
-            "busy": median_of(busy[name], "s"),
-            "variance": Figure(variance),
-            "cost": Figure(costs[name], "s"),
-        }
-        if name == "this":
-            for other in costs:
-                if other != name:
-                    figures[f"to {other}"] = Figure(costs[name] / costs[other])
-            if options.against is not None:
-                figures["means"] = Figure(_apart(seen, np.array(images[options.against_name])))
-        print(f"{scene}, {name}: " + ", ".join(f"{k} {f.value:.3g}" for k, f in figures.items()))
-        labels = {"scene": scene, "version": name, "samples": str(options.spp)}
-        row = Row(labels, figures)
-        save("noise", [row], options, options.variant, RENDERING, checkout=folder)
+            pictures[name].append(_rendered(folder, turn, name == _MESHES, options))
+    for scene in options.scenes:
+        rows = _rows(scene, pictures, options)
+        for name, folder in versions.items():
+            save("noise", [rows[name]], options, options.variant, RENDERING, checkout=folder)
 
 
-def _rendered(
-    folder: Path, scene: str, turn: int, meshes: bool, options: argparse.Namespace
-) -> tuple[list[float], np.ndarray[Any, Any]]:
-    """Seconds of pictures, and the pictures, (K, H, W, 3)."""
+@dataclass(frozen=True)
+class Pictures:
+    """What one process has rendered, by scene."""
+
+    busy: dict[str, list[float]]  # seconds
+    images: dict[str, np.ndarray[Any, Any]]  # (K, H, W, 3)
+
+
+def _rendered(folder: Path, turn: int, meshes: bool, options: argparse.Namespace) -> Pictures:
+    """All scenes, with seeds of this turn."""
     with tempfile.TemporaryDirectory() as place:
+        composed = folder / "scenes" / "composed"
         found = checkout.measured(
             folder,
             RENDER,
-            scene=str(folder / "scenes" / "composed" / f"{scene}.xml"),
+            scenes=[str(composed / f"{scene}.xml") for scene in options.scenes],
             out=place,
             size=list(options.size),
             spp=options.spp,
@@ -135,12 +123,41 @@ def _rendered(
             meshes=meshes,
             variant=options.variant,
         )
-        return found["busy"], np.load(Path(place) / "images.npy")
+        images = {scene: np.load(Path(place) / f"{scene}.npy") for scene in options.scenes}
+        return Pictures(found["busy"], images)
+
+
+def _rows(
+    scene: str, pictures: dict[str, list[Pictures]], options: argparse.Namespace
+) -> dict[str, Row]:
+    """The rows of one scene, by version, this one last."""
+    costs: dict[str, float] = {}
+    images: dict[str, np.ndarray[Any, Any]] = {}
+    rows = {}
+    for name, processes in pictures.items():
+        busy = [seconds for process in processes for seconds in process.busy[scene]]
+        images[name] = np.concatenate([process.images[scene] for process in processes])
+        variance = float(images[name].var(axis=0, ddof=1, dtype=np.float64).mean())
+        costs[name] = variance * float(np.median(busy))
+        figures = {
+            "busy": median_of(busy, "s"),
+            "variance": Figure(variance),
+            "cost": Figure(costs[name], "s"),
+        }
+        other = options.against_name
+        if name == "this" and other in costs:
+            figures["ratio"] = Figure(costs[name] / costs[other])
+            figures["means"] = Figure(_apart(images[name], images[other]))
+        if name == "this" and _MESHES in costs:
+            figures["to_path"] = Figure(costs[name] / costs[_MESHES])
+        print(f"{scene}, {name}: " + ", ".join(f"{k} {f.value:.3g}" for k, f in figures.items()))
+        rows[name] = Row({"scene": scene, "version": name, "samples": str(options.spp)}, figures)
+    return rows
 
 
 def _apart(a: np.ndarray[Any, Any], b: np.ndarray[Any, Any]) -> float:
     """The largest difference of the means of rows of pixels, in standard errors."""
-    means = [x.mean(axis=(2, 3)) for x in (a, b)]
+    means = [x.mean(axis=(2, 3), dtype=np.float64) for x in (a, b)]
     error = np.sqrt(sum(m.var(axis=0, ddof=1) / len(m) for m in means))
     return float(np.abs((means[0].mean(axis=0) - means[1].mean(axis=0)) / error).max())
 
