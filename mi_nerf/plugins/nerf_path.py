@@ -14,7 +14,7 @@ from .marching import MarchingIntegrator
 from .path_state import PathSettings
 from .paths import PathsBehind
 from .placement import find_fields
-from .power import emitter_power, field_powers
+from .power import field_powers, field_share
 from .sampled import SampledField
 from .solid_scene import SolidScene, check_no_loose_field
 from .wanted_gradients import check_gradients
@@ -52,9 +52,9 @@ class NerfPathIntegrator(MarchingIntegrator):
        - At matt and glossy surfaces, sample directions towards the fields besides those that
          the surface prefers and those of the scene's lights. Worth its time where fields are
          the lamps; among other lights a path costs several times as much and is hardly less
-         noisy. With :monosp:`auto`, it is done if more than a quarter of all power is theirs when a
-         scene is first rendered (:py:mod:`mi_nerf.plugins.power`). The mean is the same.
-         (Default: auto)
+         noisy. With :monosp:`auto`, it is done if more than a quarter of the light around fields is
+         theirs when a scene is first rendered (:py:mod:`mi_nerf.plugins.power`). The mean is the
+         same. (Default: auto)
      * - paths
        - |int|
        - Paths that go on behind the fields for every camera ray. (Default: 1)
@@ -212,11 +212,8 @@ class NerfPathIntegrator(MarchingIntegrator):
             return None
         media = [marched.placed.medium for marched in fields]
         if self._lamps is None or not self._lamps.are(media):
-            powers, others = field_powers(fields), 0.0
-            if self.sample_fields == "auto":
-                others = emitter_power(solid)
-            shine = sum(powers) > _SHARE * (sum(powers) + others)
-            sampled = self.sample_fields is True or shine
+            powers = field_powers(fields)
+            sampled = self.sample_fields is True or field_share(solid, fields, powers) > _SHARE
             self._lamps = _Lamps(media, powers if sampled else None)
         return self._lamps.powers
 
@@ -235,6 +232,6 @@ class _Lamps:
 
 
 _UNLIMITED = 2**31 - 1
-_SHARE = 0.25  # of all power: fields with more are sampled as lights
+_SHARE = 0.25  # of the light around fields: if more is theirs, they are sampled as lights
 
 mi.register_integrator("nerf_path", NerfPathIntegrator)

@@ -50,19 +50,43 @@ def test_power_of_a_thin_box() -> None:
     assert 1.0 < power / (4 * np.pi * 2e-3 * 1.0) < 1.6
 
 
-def test_power_of_emitters() -> None:
-    from mi_nerf.plugins.power import emitter_power
+def test_share_of_a_field_among_lights() -> None:
+    """Closed form: P / 4πR² (atan 2 − atan 1) against what a far point light and a sky bring."""
+    from mi_nerf.plugins.power import field_powers, field_share
 
-    scene, _, _ = loaded(lamp=overhead((3, 3, 3), half=0.5))
-    assert emitter_power(scene) == pytest.approx(3 * np.pi, rel=1e-3)
-    scene, _, _ = loaded(point=point_light([0, 0, 3], 2.0))
-    assert emitter_power(scene) == pytest.approx(8 * np.pi, rel=1e-3)
-    scene, _, _ = loaded(
-        point=point_light([0, 0, 3], 2.0), lamp=overhead((3, 3, 3), half=0.5), floor=floor()
-    )
-    assert emitter_power(scene) == pytest.approx(11 * np.pi, rel=3e-2)  # by turns
-    scene, _, _ = loaded(floor=floor())
-    assert emitter_power(scene) == 0
+    field = {"a": slab(place().scale(0.5), 1e4, GLOW)}
+    own = 6 * np.pi * np.mean(GLOW) / (4 * np.pi * 0.75) * (np.arctan(2) - np.arctan(1))
+    lights = {
+        "point": (point_light([0, 0, 100], 5e3), 0.5),
+        "sky": ({"type": "constant", "radiance": 0.1}, 0.1 * 4 * np.pi),
+    }
+    for chosen in ([], ["point"], ["sky"], ["point", "sky"]):
+        scene, integrator, found = loaded(**field, **{name: lights[name][0] for name in chosen})
+        share = field_share(integrator._solid.of(scene), found, field_powers(found))
+        expected = own / (own + sum(lights[name][1] for name in chosen))
+        assert share == pytest.approx(expected, rel=2e-2)
+
+
+def test_a_light_with_a_texture_that_cannot_send_rays(tmp_path: Any) -> None:
+    """Colours of vertices are such: Mitsuba's emitters of them can only be seen."""
+    triangle = mi.Mesh("triangle", 3, 1)
+    params = mi.traverse(triangle)
+    params["vertex_positions"] = mi.Float([0, 0, 3, 1, 0, 3, 0, 1, 3])
+    params["faces"] = mi.UInt32([0, 2, 1])
+    params.update()
+    triangle.add_attribute("vertex_color", 3, [1.0] * 9)
+    triangle.write_ply(str(tmp_path / "triangle.ply"))
+    lamp = {
+        "type": "ply",
+        "filename": str(tmp_path / "triangle.ply"),
+        "emitter": {
+            "type": "area",
+            "radiance": {"type": "mesh_attribute", "name": "vertex_color"},
+        },
+    }
+    scene, integrator, _ = loaded(lamp=lamp, floor=floor(), field=slab(place(), 0.1, GLOW))
+    assert integrator._scene(scene)._backdrop is not None
+    assert np.isfinite(np.array(mi.render(scene, spp=1))).all()
 
 
 @pytest.mark.parametrize(
