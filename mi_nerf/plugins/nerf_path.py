@@ -48,13 +48,13 @@ class NerfPathIntegrator(MarchingIntegrator):
          for that one surfaces and fields between are looked for
          (:py:mod:`mi_nerf.plugins.light_choice`). (Default: 8)
      * - sample_fields
-       - |bool| or |string|
-       - At matt and glossy surfaces, sample directions towards the fields besides those that
-         the surface prefers and those of the scene's lights. Worth its time where fields are
-         the lamps; among other lights a path costs several times as much and is hardly less
-         noisy. With :monosp:`auto`, it is done if more than a quarter of the light around fields is
-         theirs when a scene is first rendered (:py:mod:`mi_nerf.plugins.power`). The mean is the
-         same. (Default: auto)
+       - |string|
+       - :monosp:`true` or :monosp:`false`, also as a boolean, or :monosp:`auto`: at matt and glossy
+         surfaces, sample directions towards the fields besides those that the surface prefers
+         and those of the scene's lights. Worth its time where fields are the lamps; among other
+         lights a path costs several times as much and is hardly less noisy. With :monosp:`auto`,
+         it is done if more than a quarter of the light around fields is theirs when a scene is
+         first rendered (:py:mod:`mi_nerf.plugins.power`). The mean is the same. (Default: auto)
      * - paths
        - |int|
        - Paths that go on behind the fields for every camera ray. (Default: 1)
@@ -146,9 +146,11 @@ class NerfPathIntegrator(MarchingIntegrator):
         self.emitter_candidates = self._integer(props, "emitter_candidates", 8, least=1)
         if props.get("max_depth", -1) < 0:  # the base class has a default of its own
             self.max_depth = _UNLIMITED
-        self.sample_fields = props.get("sample_fields", "auto")
-        if not isinstance(self.sample_fields, bool) and self.sample_fields != "auto":
-            raise self._unlike("sample_fields", f"'{self.sample_fields}'", "true, false or auto")
+        chosen = props.get("sample_fields", "auto")
+        known = {True: True, False: False, "true": True, "false": False, "auto": "auto"}
+        if chosen not in known:
+            raise self._unlike("sample_fields", f"'{chosen}'", "true, false or auto")
+        self.sample_fields = known[chosen]
         self._solid, self._keep = SolidScene(), False
         self._lamps: _Lamps | None = None
 

@@ -219,6 +219,9 @@ def _mesh_of(placed: Any, cells: int) -> Any:
     density = np.pad(density, 1)
     vertices, faces, _, _ = marching_cubes(density, np.log(2) / step)
     vertices = lower + (vertices - 0.5) * step
+    corners = vertices[faces]
+    if np.sum(corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])) < 0:
+        faces = faces[:, ::-1]  # they look outwards if the volume within is positive
     normals = _normals(vertices, faces)
     inside = (vertices - 0.5 * step * normals).T.astype(np.float32)
     _, color = field.density_emission(
