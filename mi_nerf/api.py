@@ -224,17 +224,18 @@ def render(
     Raises:
         InputError: if the target or its dataset cannot be read, or the extra is not installed.
     """
-    from .images.denoise import denoised_frames, denoiser
     from .tasks import render as rendering
-
-    if denoise:
-        denoiser()  # may be missing: said before anything is rendered
 
     source = target.folder if isinstance(target, Run) else target
     count, images = rendering.frames_of(
-        source, active_variant(variant), path=path, frames=frames, size=size, spp=spp
+        source,
+        active_variant(variant),
+        path=path,
+        frames=frames,
+        size=size,
+        spp=spp,
+        denoise=denoise,
     )
-    images = denoised_frames(images) if denoise else images
     result = []
     with closing(images), progress_bar("render", "frame", count, show=show) as bar:
         for _, image in images:

@@ -10,7 +10,6 @@ from tyro.conf import Positional, arg
 
 from ..base.checks import valid_size
 from ..base.variants import choose_variant
-from ..images.denoise import denoised_frames, denoiser
 from ..scene_xml.library import scenes
 from ..tasks.render import check_output, frames_of, output_kind, write_frames
 from .shared import Variant, positive, progress_bar
@@ -56,8 +55,6 @@ class Render:
         if self.size is not None:
             valid_size(self.size)
         check_output(self.out, self.frames or 1)
-        if self.denoise:
-            denoiser()  # may be missing: said before anything is rendered
         count, images = frames_of(
             self._target(),
             choose_variant(self.variant),
@@ -66,8 +63,8 @@ class Render:
             still=output_kind(self.out) == "picture",
             size=self.size,
             spp=self.spp,
+            denoise=self.denoise,
         )
-        images = denoised_frames(images) if self.denoise else images
         with progress_bar("render", "frame", count) as bar:
             write_frames(self.out, count, images, on_frame=bar.update)
         print(f"{self.out}: {count} frame{'s' if count != 1 else ''}")

@@ -22,6 +22,7 @@ from ..cameras.pinhole import Intrinsics
 from ..cameras.poses import mitsuba_from_opengl, opengl_from_mitsuba
 from ..cameras.trajectory import Poses, forward_spiral, orbit, orbit_like, spiral_like
 from ..data import Dataset, held_out_split, load_dataset
+from ..images.denoise import denoised_frames, denoiser
 from ..images.write import on_white, write_picture
 from ..march.view import render_view
 from ..scene_xml.scene_file import SceneFile
@@ -46,6 +47,7 @@ def frames_of(
     still: bool = False,
     size: tuple[int, int] | None = None,
     spp: int | None = None,
+    denoise: bool = False,
 ) -> tuple[int, Frames]:
     """Renders a run along a camera path, or a Mitsuba XML scene.
 
@@ -54,13 +56,33 @@ def frames_of(
         frames: along the path; default: 60, or all test views; with ``still``, one.
         size: width and height; default: those of the run's images or the scene's film.
         spp: samples a pixel; default: 1 for runs, the scene's own for XML.
+        denoise: take noise out of the frames.
 
     Returns:
         The number of frames and an iterator over them.
 
     Raises:
-        InputError: if there is neither, or what was asked for does not suit it.
+        InputError: if there is neither, what was asked for does not suit it, or the denoiser is
+            not installed.
     """
+    if denoise:
+        denoiser()  # may be missing: said before anything is rendered
+        count, noisy = _frames_of(source, variant, path, frames, still, size, spp, apart=True)
+        return count, denoised_frames(noisy)
+    return _frames_of(source, variant, path, frames, still, size, spp)
+
+
+def _frames_of(
+    source: str | Path | Target,
+    variant: str,
+    path: Path_ | None,
+    frames: int | None,
+    still: bool,
+    size: tuple[int, int] | None,
+    spp: int | None,
+    apart: bool = False,
+) -> tuple[int, Frames]:
+    """The same; ``apart`` as of :func:`scene_frames`."""
     if not isinstance(source, Target):
         source = Path(source)
         if not source.exists():
@@ -79,6 +101,7 @@ def frames_of(
                 frames=frames or (1 if still else 60),
                 size=size,
                 spp=spp or 0,
+                apart=apart,
             )
         source = open_target(source)
     path = path or default_path(source)
@@ -128,10 +151,15 @@ def scene_frames(
     frames: int = 1,
     size: tuple[int, int] | None = None,
     spp: int = 0,
+    apart: bool = False,
 ) -> tuple[int, Frames]:
     """Renders a Mitsuba scene: all of its sensors, or the first one moved along a path.
 
     The variant is set until the frames are exhausted or closed.
+
+    Args:
+        apart: no sample counts for more than one pixel, whatever filter the film has: to a
+            denoiser, noise that pixels share looks like what they show.
 
     Raises:
         InputError: if the scene cannot be loaded or has no sensor.
@@ -150,7 +178,10 @@ def scene_frames(
     def produce() -> Generator[Any, None, None]:
         """The number of frames, and then these."""
         with using_variant(variant):
-            scene = SceneFile(scene_path).load()
+            file = SceneFile(scene_path)
+            if apart:
+                _keep_apart(file)
+            scene = file.load()
             sensors = scene.sensors()
             if not sensors:
                 raise InputError(f"{scene_path}: has no sensor, expected at least one")
@@ -173,6 +204,19 @@ def scene_frames(
 
     produced = produce()
     return next(produced), produced
+
+
+def _keep_apart(file: SceneFile) -> None:
+    """Gives all films a box as their reconstruction filter."""
+    import mitsuba as mi
+
+    for rfilter in file.plugins("ReconstructionFilter"):
+        for name in list(rfilter.keys()):
+            del rfilter[name]
+        rfilter.set_plugin_name("box")
+    if not file.plugins("ReconstructionFilter"):
+        for film in file.plugins("Film"):
+            film["rfilter"] = mi.load_dict({"type": "box"})
 
 
 def write_frames(

@@ -64,3 +64,32 @@ def test_noise_goes() -> None:
     before, after = image[inside], denoised(image)[inside]
     assert np.abs(after - 0.5).mean() < 0.3 * np.abs(before - 0.5).mean()
     assert after.mean() == pytest.approx(before.mean(), rel=3e-2)
+
+
+@pytest.mark.parametrize(
+    "rfilter", ['<rfilter type="gaussian"><float name="stddev" value="1"/></rfilter>', ""]
+)
+def test_pixels_of_scenes_do_not_share_noise(
+    rfilter: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the film's filter is: a lamp that ends between two pixels does not leak."""
+    import mi_nerf
+
+    monkeypatch.setitem(
+        sys.modules, "mitsuba_oidn", SimpleNamespace(denoise=lambda color, **_: color)
+    )
+    scene = tmp_path / "scene.xml"
+    scene.write_text(
+        """<scene version="3.0.0"><integrator type="path"/>
+        <sensor type="orthographic"><film type="hdrfilm">
+        <integer name="width" value="8"/><integer name="height" value="8"/>"""
+        + rfilter
+        + """</film><transform name="to_world"><lookat origin="0,0,3" target="0,0,0" up="0,1,0"/>
+        </transform></sensor><shape type="rectangle"><transform name="to_world">
+        <scale value="0.5"/></transform><emitter type="area"/></shape></scene>"""
+    )
+    (image,) = mi_nerf.render(scene, spp=4, denoise=True, variant="llvm_ad_rgb", show=False)
+    lit = image[..., 0] > 0
+    assert lit.sum() == 16 and image[..., 0].std() > 0.3
+    (shared,) = mi_nerf.render(scene, spp=4, variant="llvm_ad_rgb", show=False)
+    assert (shared[..., 0] > 0).sum() > 16
