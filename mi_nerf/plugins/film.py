@@ -334,15 +334,15 @@ class FieldIntegrator(ADIntegrator):
         sampler.set_sample_count(spp)
         spp = sampler.sample_count()  # as many as it can spread
         per_pass = max(d for d in range(1, per_pass + 1) if spp % d == 0)
+        sensor.film().prepare(self.aov_names())
+        sampler.set_samples_per_wavefront(per_pass)
+        sampler.seed(seed, int(dr.prod(_sampled_size(sensor.film()))) * per_pass)
         for i in range(spp // per_pass):
-            # Prepared anew, as each pass ends in clones; set forward to what it has not drawn.
-            sampler, _ = self.prepare(sensor, seed, spp, self.aov_names())
-            sampler.set_samples_per_wavefront(per_pass)
-            sampler.seed(seed, int(dr.prod(_sampled_size(sensor.film()))) * per_pass)
-            for _ in range(i):
-                sampler.next_1d()
-                sampler.advance()
-            yield _seed_of(seed, i), sampler, per_pass
+            sampler.schedule_state()
+            dr.eval()
+            yield _seed_of(seed, i), sampler.clone(), per_pass
+            sampler.next_1d()  # other places within the strata than in this pass
+            sampler.advance()
 
     def _splat(
         self,

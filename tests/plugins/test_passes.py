@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -49,6 +50,22 @@ def test_samples_are_spread_over_all_passes(sampler: str, at_a_time: int) -> Non
     if sampler in ("stratified", "multijitter"):
         both = np.sort(cells[..., 0] * side + cells[..., 1], axis=1)
         assert (both == np.arange(count)).mean() > 0.99
+
+
+def test_passes_compile_nothing_after_the_second() -> None:
+    """Whatever their number: a large picture has many."""
+    scene = scene_with("multijitter", paths(), 16)
+    integrator, sensor = scene.integrator(), scene.sensors()[0]
+    known: set[Any] = set()
+    new = []
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for _ in integrator._passes(scene, sensor, 3, 16, 2 * PIXELS):
+            kernels = {k["hash"] for k in dr.kernel_history() if k.get("hash")}
+            dr.kernel_history_clear()
+            new.append(len(kernels - known))
+            known |= kernels
+    assert new[0] > 0 and new[2:] == [0] * 6
 
 
 def test_passes_of_independent_samples_have_seeds_of_their_own() -> None:
