@@ -236,6 +236,7 @@ def render(
     frames: int | None = None,
     size: tuple[int, int] | None = None,
     spp: int | None = None,
+    denoise: bool = False,
     variant: str | None = None,
     show: bool = True,
 ) -> list[Image]:
@@ -248,19 +249,26 @@ def render(
         frames: along the path; default: 60, all for ``test``.
         size: width and height in pixels.
         spp: samples a pixel.
+        denoise: take noise out of the pictures; needs the extra ``mi_nerf[denoise]``.
         show: show a progress bar.
 
     Returns:
         Linear premultiplied RGBA, (H, W, 4) each; :func:`mi_nerf.on_white` makes them visible.
 
     Raises:
-        InputError: if the target or its dataset cannot be read.
+        InputError: if the target or its dataset cannot be read, or the extra is not installed.
     """
     from .tasks import render as rendering
 
     source = target.folder if isinstance(target, Run) else target
     count, images = rendering.frames_of(
-        source, active_variant(variant), path=path, frames=frames, size=size, spp=spp
+        source,
+        active_variant(variant),
+        path=path,
+        frames=frames,
+        size=size,
+        spp=spp,
+        denoise=denoise,
     )
     result = []
     with closing(images), progress_bar("render", "frame", count, show=show) as bar:

@@ -29,7 +29,7 @@ class Render:
 
     mi-nerf render scene.xml -o scene.exr --spp 64
 
-    mi-nerf render table -o table.png
+    mi-nerf render table -o table.png --spp 16 --denoise
 
     mi-nerf render table -o film.mp4 --path orbit --workers 4
     """
@@ -47,6 +47,8 @@ class Render:
     """Width and height; default: those of the run's images or the scene's film."""
     spp: int | None = None
     """Samples a pixel; default: 1 for runs, the scene's own for XML."""
+    denoise: bool = False
+    """Take the noise out of the pictures, by Open Image Denoise: pip install 'mi_nerf[denoise]'."""
     workers: Workers = 0
     executor: ExecutorName = None
     variant: Variant = None
@@ -65,6 +67,7 @@ class Render:
             "still": output_kind(self.out) == "picture",
             "size": self.size,
             "spp": self.spp,
+            "denoise": self.denoise,
         }
         variant = choose_variant(self.variant)
         with open_executor(self.workers, self.executor, folder=self.out) as others:

@@ -299,17 +299,17 @@ class FieldIntegrator(ADIntegrator):
     def _passes(
         self, scene: mi.Scene, sensor: mi.Sensor, seed: Any, spp: int, limit: int
     ) -> Iterator[CameraRays]:
-        """Camera rays, in passes of at most ``limit`` or one a pixel, with seeds of their own."""
+        """Camera rays, in passes of at most ``limit`` or one a pixel.
+
+        Samplers that spread their samples evenly do so over all passes; the independent one
+        has a seed for each.
+        """
         film = sensor.film()
         spp = spp or sensor.sampler().sample_count()
         pixels = int(dr.prod(film.crop_size()))
         per_pass = max(1, min(spp, limit // max(pixels, 1)))
-        passes = -(-spp // per_pass)
-        for i in range(passes):
-            count = spp if passes == 1 else min(per_pass, spp - i * per_pass)
-            pass_seed = seed if i == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(i))[0]
-            sampler, _ = self.prepare(sensor, pass_seed, count, self.aov_names())
-            ray, weight, position = self.sample_rays(scene, sensor, sampler)
+        for pass_seed, sampler, count in self._samplers(sensor, seed, spp, per_pass):
+            ray, weight, position = self.sample_rays(scene, sensor, _Wavefront(sampler, count))
             width = dr.width(position)  # a radiance meter has one ray for all
             ray.o, ray.d = ray.o + dr.zeros(mi.Float, width), ray.d + dr.zeros(mi.Float, width)
             random = self._draw(sampler, dr.width(ray), pass_seed)
@@ -317,6 +317,32 @@ class FieldIntegrator(ADIntegrator):
             sampler.schedule_state()
             dr.eval()
             yield CameraRays(ray, weight, position, random, sampler)
+
+    def _samplers(
+        self, sensor: mi.Sensor, seed: Any, spp: int, per_pass: int
+    ) -> Iterator[tuple[Any, mi.Sampler, int]]:
+        """For each pass of at most so many samples a pixel: a seed, a sampler, and how many."""
+        spread = sensor.sampler().class_name() != "IndependentSampler"
+        if per_pass == spp or not spread:
+            passes = -(-spp // per_pass)
+            for i in range(passes):
+                count = spp if passes == 1 else min(per_pass, spp - i * per_pass)
+                pass_seed = _seed_of(seed, i)
+                yield pass_seed, *self.prepare(sensor, pass_seed, count, self.aov_names())
+            return
+        sampler = sensor.sampler().clone()
+        sampler.set_sample_count(spp)
+        spp = sampler.sample_count()  # as many as it can spread
+        per_pass = max(d for d in range(1, per_pass + 1) if spp % d == 0)
+        sensor.film().prepare(self.aov_names())
+        sampler.set_samples_per_wavefront(per_pass)
+        sampler.seed(seed, int(dr.prod(_sampled_size(sensor.film()))) * per_pass)
+        for i in range(spp // per_pass):
+            sampler.schedule_state()
+            dr.eval()
+            yield _seed_of(seed, i), sampler.clone(), per_pass
+            sampler.next_1d()  # other places within the strata than in this pass
+            sampler.advance()
 
     def _splat(
         self,
@@ -383,6 +409,31 @@ class _Shown:
 def _seed_grad(seed: Any) -> Any:
     """The seed of the derivatives of a picture, as ``mi.render`` has it by default."""
     return mi.sample_tea_32(seed, 1)[0] if isinstance(seed, int) else None
+
+
+class _Wavefront:
+    """A sampler that says how many samples a pixel it draws now, not how many it spreads."""
+
+    def __init__(self, sampler: mi.Sampler, count: int) -> None:
+        self._sampler, self._count = sampler, count
+
+    def sample_count(self) -> int:
+        """Of one pass."""
+        return self._count
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._sampler, name)
+
+
+def _seed_of(seed: Any, i: int) -> Any:
+    """Of the i-th pass."""
+    return seed if i == 0 else mi.sample_tea_32(mi.UInt32(seed), mi.UInt32(i))[0]
+
+
+def _sampled_size(film: mi.Film) -> Any:
+    """Of the part of the film that is sampled, in pixels."""
+    border = 2 * film.rfilter().border_size() if film.sample_border() else 0
+    return film.crop_size() + border
 
 
 class _Kept:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
@@ -13,6 +14,8 @@ from .marching import MarchingIntegrator
 from .path_state import PathSettings
 from .paths import PathsBehind
 from .placement import find_fields
+from .power import field_powers, field_share
+from .sampled import SampledField
 from .solid_scene import SolidScene, check_no_loose_field
 from .wanted_gradients import check_gradients
 
@@ -38,12 +41,20 @@ class NerfPathIntegrator(MarchingIntegrator):
      * - hide_emitters
        - |bool|
        - Hide lights and environment from cameras; fields are seen. (Default: false)
+     * - emitter_candidates
+       - |int|
+       - Points of light sources that every matt or glossy surface looks at; one of them is chosen,
+         with a probability that follows what it would bring if nothing were between, and only
+         for that one surfaces and fields between are looked for
+         (:py:mod:`mi_nerf.plugins.light_choice`). (Default: 8)
      * - sample_fields
-       - |bool|
-       - At matt and glossy surfaces, sample directions towards the fields besides those that
-         the surface prefers and those of the scene's lights. Worth its time where fields are
-         the lamps; among other lights a path costs several times as much and is hardly less
-         noisy. The mean is the same. (Default: false)
+       - |string|
+       - :monosp:`true` or :monosp:`false`, also as a boolean, or :monosp:`auto`: at matt and glossy
+         surfaces, sample directions towards the fields besides those that the surface prefers
+         and those of the scene's lights. Worth its time where fields are the lamps; among other
+         lights a path costs several times as much and is hardly less noisy. With :monosp:`auto`,
+         it is done if more than a quarter of the light around fields is theirs when a scene is
+         first rendered (:py:mod:`mi_nerf.plugins.power`). The mean is the same. (Default: auto)
      * - paths
        - |int|
        - Paths that go on behind the fields for every camera ray. (Default: 1)
@@ -132,10 +143,16 @@ class NerfPathIntegrator(MarchingIntegrator):
         self._integer(props, "max_depth", -1, least=0)
         self._integer(props, "rr_depth", 5, least=1)
         super().__init__(props)
+        self.emitter_candidates = self._integer(props, "emitter_candidates", 8, least=1)
         if props.get("max_depth", -1) < 0:  # the base class has a default of its own
             self.max_depth = _UNLIMITED
-        self.sample_fields = bool(props.get("sample_fields", False))
+        chosen = props.get("sample_fields", "auto")
+        known = {True: True, False: False, "true": True, "false": False, "auto": "auto"}
+        if chosen not in known:
+            raise self._unlike("sample_fields", f"'{chosen}'", "true, false or auto")
+        self.sample_fields = known[chosen]
         self._solid, self._keep = SolidScene(), False
+        self._lamps: _Lamps | None = None
 
     def render_backward(self, scene: mi.Scene, *args: Any, **options: Any) -> None:
         """Carries the gradient of an image to the parameters; see :class:`FieldIntegrator`."""
@@ -165,6 +182,7 @@ class NerfPathIntegrator(MarchingIntegrator):
             "NerfPathIntegrator[\n"
             f"  max_depth = {depth}, rr_depth = {self.rr_depth},\n"
             f"{self._settings()}"
+            f"  emitter_candidates = {self.emitter_candidates},\n"
             f"  sample_fields = {self.sample_fields}\n"
             "]"
         )
@@ -175,21 +193,47 @@ class NerfPathIntegrator(MarchingIntegrator):
         if not found:
             check_no_loose_field(scene)
         fields = self._marched(found) if self.max_depth > 0 else []
-        normals = self._wants_normals(fields)
+        normals, solid = self._wants_normals(fields), self._solid.of(scene)
+        powers = self._powers(solid, fields)
         settings = PathSettings(
             max_depth=self.max_depth,
             rr_depth=self.rr_depth,
             paths=self.paths,
+            emitter_candidates=self.emitter_candidates,
             hide_lights=not self.show_background,
-            sample_fields=self.sample_fields,
+            field_powers=powers,
             jitter=self.jitter,
             stop=min((field.march.stop for field in fields), default=0.0),
             keep=self._keep,
         )
-        solid = self._solid.of(scene)
         return FieldScene(fields, PathsBehind(solid, fields, settings, normals), normals)
+
+    def _powers(self, solid: mi.Scene, fields: list[SampledField]) -> list[float] | None:
+        """Those of the fields if they are sampled as lights; as they were at first."""
+        if self.sample_fields is False or not fields:
+            return None
+        media = [marched.placed.medium for marched in fields]
+        if self._lamps is None or not self._lamps.are(media):
+            powers = field_powers(fields)
+            sampled = self.sample_fields is True or field_share(solid, fields, powers) > _SHARE
+            self._lamps = _Lamps(media, powers if sampled else None)
+        return self._lamps.powers
+
+
+@dataclass(frozen=True)
+class _Lamps:
+    """What was found about the fields of a scene as light sources."""
+
+    media: list[Any]
+    powers: list[float] | None  # if they are to be sampled
+
+    def are(self, media: list[Any]) -> bool:
+        """Whether these were the fields."""
+        same = len(self.media) == len(media)
+        return same and all(a is b for a, b in zip(self.media, media, strict=True))
 
 
 _UNLIMITED = 2**31 - 1
+_SHARE = 0.25  # of the light around fields: if more is theirs, they are sampled as lights
 
 mi.register_integrator("nerf_path", NerfPathIntegrator)

@@ -55,8 +55,9 @@ class Colors:
         value = around.emitted(si, paths, vertex.depth, attached=True)
         if vertex.following is None:
             return value
+        assert vertex.chosen is not None
         emitters = around.to_emitters(
-            si, bsdf, paths, chance, vertex.through > 0, attached=True, every=True
+            si, bsdf, paths, vertex.chosen, vertex.through > 0, attached=True, every=True
         )
         turned = around.turned(si, bsdf, vertex.following, chance, vertex.going)
         with dr.resume_grad():

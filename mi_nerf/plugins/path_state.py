@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from ..base.arrays import taken
 from .colors import Spectrum
+from .light_choice import Chosen
 from .sampled import Rays
 
 
@@ -21,7 +22,8 @@ class PathSettings:
     rr_depth: int  # from which on paths end at random
     paths: int  # for every camera ray
     hide_lights: bool  # from cameras
-    sample_fields: bool  # as light sources
+    emitter_candidates: int  # points of light sources, one of which is chosen
+    field_powers: list[float] | None  # of fields that are sampled as light sources
     jitter: bool  # of the samples on segments
     stop: float  # what fields must let pass for a path to go on
     keep: bool = False  # what each path brings, for derivatives
@@ -120,6 +122,7 @@ class Chance:
     """Random numbers of N paths for one vertex."""
 
     emitter: Any
+    choice: Any  # among points of emitters
     bsdf: Any
     bsdf_component: Any
     roulette: Any
@@ -145,6 +148,7 @@ class Vertex:
     chance: Chance
     following: Paths | None = None  # as they went on; None at the end of the longest paths
     going: Any = None  # which of them did
+    chosen: Chosen | None = None  # the points of emitters; None at the end of the longest paths
     through: Any = None  # N: what fields let pass of the light of the emitter that was chosen
     shone: Any = None  # N colours: what fields sent from the direction that was chosen; or None
 

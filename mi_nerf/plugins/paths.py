@@ -70,7 +70,8 @@ class PathsBehind(Backdrop):
         """
         self._scene, self._settings, self._normals = scene, settings, normals
         self._fields = [field.unbounded() for field in marched]
-        lights = FieldLight(self._fields if settings.sample_fields else [])
+        lamps = [] if settings.field_powers is None else self._fields
+        lights = FieldLight(lamps, settings.field_powers)
         self._around = Surroundings(scene, settings, lights)
 
     # ---------------------------------- What cameras see ----------------------------------
@@ -217,14 +218,15 @@ class PathsBehind(Backdrop):
         active = si.is_valid() & (dr.max(paths.throughput) > 0)
         smooth = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         every = image.every_connection
-        emitters = around.to_emitters(si, bsdf, paths, chance, smooth, every=every)
+        chosen = around.choose_light(si, bsdf, paths, chance, smooth)
+        emitters = around.to_emitters(si, bsdf, paths, chosen, smooth, every=every)
         fields = around.to_fields(si, bsdf, paths, chance, smooth, every=every)
         following, going = around.turn(si, bsdf, paths, depth, chance, active)
         covered = paths.transmittance - following.transmittance
         image.cover(slot, dr.select(si.is_valid(), covered, 0))
-        dr.eval(emitters, fields, following, going)
+        dr.eval(emitters, fields, following, going, chosen)
         image.evaluate()
-        vertex.following, vertex.going = following, going
+        vertex.following, vertex.going, vertex.chosen = following, going, chosen
         vertex.through = self._add_emitters(emitters, slot, chance.jitter[0], image)
         vertex.shone = self._add_fields(fields, slot, chance.jitter[1], image)
         image.left(vertex)
@@ -273,7 +275,7 @@ class PathsBehind(Backdrop):
         one, two = sampler.next_1d, sampler.next_2d
         jitter = [one() for _ in range(3)] if self._settings.jitter else [None] * 3
         point = mi.Point3f(*two(), one())
-        chance = Chance(two(), two(), one(), one(), one(), point, jitter)
+        chance = Chance(two(), one(), two(), one(), one(), one(), point, jitter)
         sampler.schedule_state()
         dr.eval(chance)
         return chance.take(slot)

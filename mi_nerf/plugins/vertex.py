@@ -17,6 +17,7 @@ from mitsuba.python.ad.integrators.common import mis_weight
 
 from .colors import unpolarized
 from .field_light import FieldLight
+from .light_choice import Chosen, choose
 from .path_state import Chance, Connections, Ends, Paths, PathSettings
 
 _MOST_SURVIVE = 0.95  # of a wavefront in Russian roulette, as in Mitsuba's path tracer
@@ -46,12 +47,21 @@ class Surroundings:
         with dr.resume_grad(when=attached):
             return paths.throughput * weight * unpolarized(ds.emitter.eval(si, shown))
 
+    def choose_light(self, si: Any, bsdf: Any, paths: Paths, chance: Chance, active: Any) -> Chosen:
+        """The points of light sources to which surfaces are connected."""
+
+        def brings(number: Any) -> Any:
+            return dr.max(self._connect(si, bsdf, paths, number, active)[1])
+
+        count = self.settings.emitter_candidates if self.scene.emitters() else 1
+        return choose(brings, chance.emitter, chance.choice, count, active)
+
     def to_emitters(
         self,
         si: Any,
         bsdf: Any,
         paths: Paths,
-        chance: Chance,
+        chosen: Chosen,
         active: Any,
         *,
         attached: bool = False,
@@ -63,22 +73,44 @@ class Surroundings:
             every: whether connections matter that bring no light as things are.
         """
         # With ``attached``, ``active`` says already what is in sight.
-        ds, weight = self.scene.sample_emitter_direction(si, chance.emitter, not attached, active)
+        ds, light, active = self._connect(
+            si, bsdf, paths, chosen.number, active, visible=not attached, attached=attached
+        )
+        with dr.resume_grad(when=attached):
+            light = light * chosen.weight
+        # Of emitters at infinity the scene says a distance, within which not all fields lie.
+        infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
+        reach = dr.select(infinite, dr.inf, ds.dist)
+        wanted = active if every else dr.max(dr.detach(light)) > 0
+        return Connections(mi.Ray3f(si.p, ds.d, 0, si.wavelengths), reach, light, wanted)
+
+    def _connect(
+        self,
+        si: Any,
+        bsdf: Any,
+        paths: Paths,
+        number: Any,
+        active: Any,
+        *,
+        visible: bool = False,
+        attached: bool = False,
+    ) -> tuple[Any, Any, Any]:
+        """What a point of a light source, found from ``number``, brings; and for which paths.
+
+        Args:
+            visible: only where no surface is between.
+        """
+        ds, weight = self.scene.sample_emitter_direction(si, number, visible, active)
         active = active & (ds.pdf != 0)
         with dr.resume_grad(when=attached):
             if attached:
                 power = self.scene.eval_emitter_direction(si, ds, active)
                 weight = power / dr.select(active, dr.detach(ds.pdf), 1)
             value, pdf = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(ds.d), active)
-            weight = unpolarized(weight) * dr.detach(
-                dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf))
-            )
+            share = dr.detach(dr.select(ds.delta, 1, mis_weight(ds.pdf, pdf)))
+            weight = unpolarized(weight) * share
             light = dr.select(active, paths.throughput * unpolarized(value) * weight, 0)
-        # Of emitters at infinity the scene says a distance, within which not all fields lie.
-        infinite = mi.has_flag(ds.emitter.flags(), mi.EmitterFlags.Infinite)
-        reach = dr.select(infinite, dr.inf, ds.dist)
-        wanted = active if every else dr.max(dr.detach(light)) > 0
-        return Connections(mi.Ray3f(si.p, ds.d, 0, si.wavelengths), reach, light, wanted)
+        return ds, light, active
 
     def to_fields(
         self,

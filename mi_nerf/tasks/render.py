@@ -21,6 +21,7 @@ from ..cameras.pinhole import Intrinsics
 from ..cameras.poses import mitsuba_from_opengl, opengl_from_mitsuba
 from ..cameras.trajectory import Poses, forward_spiral, orbit, orbit_like, spiral_like
 from ..data import Dataset, held_out_split, load_dataset
+from ..images.denoise import denoised_frames, denoiser
 from ..images.write import on_white, write_picture
 from ..march.view import linear_premultiplied, render_view
 from ..scene_xml.refusals import refused_rendering
@@ -48,6 +49,7 @@ def frames_of(
     size: tuple[int, int] | None = None,
     spp: int | None = None,
     only: range | None = None,
+    denoise: bool = False,
 ) -> tuple[int, Frames]:
     """Renders a run along a camera path, or a Mitsuba XML scene.
 
@@ -57,13 +59,34 @@ def frames_of(
         size: width and height; default: those of the run's images or the scene's film.
         spp: samples a pixel; default: 1 for runs, the scene's own for XML.
         only: numbers of the frames to render; default: all.
+        denoise: take noise out of the frames.
 
     Returns:
         The number of frames in all and an iterator over those that are rendered.
 
     Raises:
-        InputError: if there is neither, or what was asked for does not suit it.
+        InputError: if there is neither, what was asked for does not suit it, or the denoiser is
+            not installed.
     """
+    if denoise:
+        denoiser()  # may be missing: said before anything is rendered
+        count, noisy = _frames_of(source, variant, path, frames, still, size, spp, only, apart=True)
+        return count, denoised_frames(noisy)
+    return _frames_of(source, variant, path, frames, still, size, spp, only)
+
+
+def _frames_of(
+    source: str | Path | Target,
+    variant: str,
+    path: Path_ | None,
+    frames: int | None,
+    still: bool,
+    size: tuple[int, int] | None,
+    spp: int | None,
+    only: range | None,
+    apart: bool = False,
+) -> tuple[int, Frames]:
+    """The same; ``apart`` as of :func:`scene_frames`."""
     if not isinstance(source, Target):
         source = Path(source)
         if not source.exists():
@@ -83,6 +106,7 @@ def frames_of(
                 size=size,
                 spp=spp or 0,
                 only=only,
+                apart=apart,
             )
         source = open_target(source)
     path = path or default_path(source)
@@ -136,10 +160,15 @@ def scene_frames(
     size: tuple[int, int] | None = None,
     spp: int = 0,
     only: range | None = None,
+    apart: bool = False,
 ) -> tuple[int, Frames]:
     """Renders a Mitsuba scene: all of its sensors, or the first one moved along a path.
 
     The variant is set until the frames are exhausted or closed.
+
+    Args:
+        apart: no sample counts for more than one pixel, whatever filter the film has: to a
+            denoiser, noise that pixels share looks like what they show.
 
     Raises:
         InputError: if the scene cannot be loaded or has no sensor.
@@ -163,6 +192,8 @@ def scene_frames(
             file = SceneFile(scene_path)
             file.substitute("Film")  # whose files are not written
             file.complete()
+            if apart:
+                _keep_apart(file)
             scene = file.load()
             sensors = scene.sensors()
             if not sensors:
@@ -189,6 +220,19 @@ def scene_frames(
 
     produced = produce()
     return next(produced), produced
+
+
+def _keep_apart(file: SceneFile) -> None:
+    """Gives all films a box as their reconstruction filter."""
+    import mitsuba as mi
+
+    for rfilter in file.plugins("ReconstructionFilter"):
+        for name in list(rfilter.keys()):
+            del rfilter[name]
+        rfilter.set_plugin_name("box")
+    if not file.plugins("ReconstructionFilter"):
+        for film in file.plugins("Film"):
+            film["rfilter"] = mi.load_dict({"type": "box"})
 
 
 def write_frames(

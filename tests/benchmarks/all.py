@@ -69,6 +69,7 @@ PLAN = (
     Task(2, "tests.benchmarks.published_step"),
     Task(2, "tests.benchmarks.published_step --rays 4096 --steps 2"),
     Task(3, "tests.benchmarks.composite"),
+    Task(3, "tests.benchmarks.light_transport", compares=True),
     Task(4, "tests.benchmarks.generate"),
     Task(4, "tests.benchmarks.inverse_loop"),
     Task(4, "tests.benchmarks.native"),

@@ -116,7 +116,7 @@ def _light_transport(file: Path, repeats: int) -> Iterator[Row]:
     integrators = {
         "path, without the field": ({"type": "path", "max_depth": 6}, {}),
         "nerf around path": (nested, cubes),
-        "nerf_path": ({"type": "nerf_path", "max_depth": 6}, cubes),
+        "nerf_path": ({"type": "nerf_path", "max_depth": 6, "sample_fields": False}, cubes),
         "nerf_path, fields sampled": (
             {"type": "nerf_path", "max_depth": 6, "sample_fields": True},
             cubes,

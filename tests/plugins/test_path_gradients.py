@@ -133,7 +133,7 @@ def cabinet(**options: Any) -> dict[str, Any]:
     where = place().translate([0.1, 0.3, -0.1]).rotate([0.3, 1, 0.2], 25).scale(0.5)
     blob = {"peak": 3.0, "width": 0.35, "extent": 2.5, "radiance": mi.ScalarVector3f(GLOW)}
     return scene_of(
-        paths(**{"max_depth": 5, "rr_depth": 50, **options}),
+        paths(**{"max_depth": 5, "rr_depth": 50, "emitter_candidates": 1, **options}),
         floor=floor(),
         mirror={**wall(2.2, half=2.0), "bsdf": tinted},
         glass={**ball, "center": [0.9, -0.6, -0.4], "bsdf": glass},
@@ -180,6 +180,17 @@ def test_derivatives_agree_with_finite_differences(slopes: Slopes) -> None:
     """Sample by sample, as these parameters do not change where paths go."""
     for key, (error, standard) in slopes.errors(COLORS, seeds=2, spp=4).items():
         assert error < 2e-3 and standard < 2e-3, (key, error, standard)
+
+
+@pytest.mark.slow
+def test_derivatives_by_what_lights_are_chosen_by() -> None:
+    """Powers and colours decide which light is chosen: differences are noisy, without bias."""
+    keys = ("lamp.emitter.radiance.value", "sky.radiance.value", "floor.bsdf.reflectance.value")
+    changes = dict.fromkeys(keys, plus)
+    slopes = Slopes(cabinet(emitter_candidates=8, sample_fields=True), changes, pull_of())
+    steps = {key: 4 * COLORS[key] for key in keys}
+    for key, (error, standard) in slopes.errors(steps, seeds=8, spp=8).items():
+        assert standard < 2e-2 and error < max(4 * standard, 2e-3), (key, error, standard)
 
 
 @pytest.mark.slow
@@ -285,7 +296,9 @@ def test_light_of_a_box_agrees_with_the_derivative_of_its_closed_form(sampled: b
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{}, {"rr_depth": 1}, {"paths": 3}, {"sample_fields": True}])
+@pytest.mark.parametrize(
+    "options", [{}, {"rr_depth": 1}, {"paths": 3, "emitter_candidates": 8}, {"sample_fields": True}]
+)
 def test_a_replay_takes_away_all_that_a_path_has_brought(
     options: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
