@@ -71,8 +71,9 @@ class Crossing:
                 keep=keep,
                 stop=whole.settings.stop,
                 tail=-(-block // 2) if exact else None,
-                fuse=not exact,
+                fuse=not marched.trained,  # which needs the same numbers in all its passes
                 emission=emission,
+                thin=not marched.trained,
             )
 
     def prepare(self, mode: dr.ADMode) -> None:

@@ -192,7 +192,7 @@ class NerfMedium(mi.Medium):
             self.field = closed_form(self._source, values, mi.TensorXf)
         except ValueError as error:
             raise InputError(f"nerfmedium: {error}") from error
-        self.march = MarchSettings(samples=128)
+        self.march = MarchSettings(samples=128, block=1 << 17)  # of formulas, large ones are quick
 
     @property
     def occupancy(self) -> Any:
