@@ -10,6 +10,7 @@ import drjit as dr
 import mitsuba as mi
 
 from ..base.errors import InputError
+from ..fields.neural import NeuralField
 from ..march.intervals import RaySegments, ray_segments
 from ..march.merging import Layer
 from ..march.normals import density_gradient
@@ -73,7 +74,7 @@ class Crossing:
                 tail=-(-block // 2) if exact else None,
                 fuse=not marched.trained,  # which needs the same numbers in all its passes
                 emission=emission,
-                thin=not marched.trained,
+                thin=not (moving or marched.trained) and isinstance(self.field, NeuralField),
             )
 
     def prepare(self, mode: dr.ADMode) -> None:
