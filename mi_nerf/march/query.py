@@ -21,11 +21,6 @@ from .strata import points_along
 _LEAST_OF_RAY = 4
 _LEAST_QUERIES = 1 << 14
 
-# Gradients of more samples than these, if activations are not kept, are carried on by some of them:
-# those of at least such a share of the mean gradient, and of the others as many as stand for all.
-_MANY = 1 << 15
-_LEAST_SHARE = 1.0
-
 # Numbers in the copies of a gradient that threads may have for themselves, together.
 _PRIVATE_NUMBERS = 1 << 26
 
@@ -54,7 +49,6 @@ class Evaluation:
         tail: int | None = None,
         fuse: bool = True,
         emission: bool = True,
-        thin: bool = False,
     ) -> None:
         """Evaluates the field; with ``keep``, activations stay for :meth:`backward`.
 
@@ -65,13 +59,12 @@ class Evaluation:
                 of large blocks in rounds, else the same.
             fuse: whether a narrow network may be asked within a kernel where nothing is kept;
                 else as in training.
-            thin: whether :meth:`backward` may draw those of many samples that it takes.
         """
         self._field, self._samples, self._block = field, samples, block
         self._graph: list[tuple[Any, Any, list[Any]]] = []
         self._tail = tail or (block // 4 if stop > 0 and block >= 4096 else block)
         self._fused = field.fused(emission) if fuse and not keep else None
-        self._emits, self._thin = emission, thin
+        self._emits = emission
         float_type = type(samples.t)
         self._channels = [dr.zeros(float_type, len(samples.t)) for _ in range(4 if emission else 1)]
         dr.make_opaque(self._channels)  # without queries they would stay constants
@@ -163,10 +156,7 @@ class Evaluation:
         samples, leaves = self._samples, list(self._field.parameters().values())
         moving = (samples.o, samples.d, samples.view, samples.t)
         leaves += [value for value in moving if dr.grad_enabled(value)]
-        asked = self.asked
-        if self._thin and not self._graph and len(asked) > _MANY:
-            asked, gradients = self._thinned(gradients)
-        kept = self._graph or ((w, v, None) for w, v in self._blocks(asked, self._block))
+        kept = self._graph or ((w, v, None) for w, v in self._blocks(self.asked, self._block))
         with _private_sums():
             for where, valid, outputs in kept:
                 outputs = outputs or self._query(where)
@@ -179,39 +169,6 @@ class Evaluation:
                 with stage("encoding_adjoint"):
                     dr.eval([dr.grad(leaf) for leaf in leaves])
         self._graph = []
-
-    def _thinned(self, gradients: list[Floats]) -> tuple[Indices, list[Floats]]:
-        """Fewer samples, and what their gradients count to make up for the others.
-
-        Most samples lie where hardly anything is, or where hardly any light comes from. One with
-        less than a share of the mean gradient stays with a probability p in proportion to it, and
-        counts 1/p times: the sum is right on average, and its noise that of so many more samples.
-        What is drawn depends on where the sample lies.
-        """
-        float_type, uint = type(gradients[0]), type(self.asked)
-        size = [dr.abs(dr.gather(float_type, g, self.asked)) for g in gradients]
-        kinds = [size[0]] + ([size[1] + size[2] + size[3]] if self._emits else [])
-        means = [dr.mean(kind) for kind in kinds]
-        share = sum(
-            dr.select(mean > 0, kind / dr.select(mean > 0, mean, 1), 0)
-            for kind, mean in zip(kinds, means, strict=True)
-        )
-        chance = dr.minimum(share * dr.opaque(float_type, 1 / _LEAST_SHARE), 1)
-        position = dr.gather(float_type, self._samples.t, self.asked)
-        bits = dr.reinterpret_array(uint, dr.float32_array_t(float_type)(position))
-        bits ^= self.asked * uint(0x9E3779B9)
-        drawn = float_type(_mixed(bits) >> 8) * 2**-24
-        stays = drawn < chance
-        dr.eval(stays, chance)
-        chosen = uint(dr.compress(stays))
-        index = dr.gather(uint, self.asked, chosen)
-        factor = 1 / dr.gather(float_type, chance, chosen)
-        scaled = [dr.gather(float_type, g, index) * factor for g in gradients]
-        dr.eval(index, scaled)
-        for gradient, value in zip(gradients, scaled, strict=True):
-            dr.scatter(gradient, value, index)
-        dr.eval(gradients)
-        return index, gradients
 
     def forward(self) -> None:
         """Fills the gradients of density and emission from those that :meth:`backward` adds to."""
@@ -258,14 +215,6 @@ def _private_sums() -> Iterator[None]:
         yield
     finally:
         dr.set_expand_threshold(before)
-
-
-def _mixed(bits: Indices) -> Indices:
-    """Numbers that look random, one for each number (the finaliser of MurmurHash3)."""
-    uint = type(bits)
-    bits = (bits ^ (bits >> 16)) * uint(0x85EBCA6B)
-    bits = (bits ^ (bits >> 13)) * uint(0xC2B2AE35)
-    return bits ^ (bits >> 16)
 
 
 def _joined(parts: list[Any], uint: Any) -> Any:

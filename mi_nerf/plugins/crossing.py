@@ -10,7 +10,6 @@ import drjit as dr
 import mitsuba as mi
 
 from ..base.errors import InputError
-from ..fields.neural import NeuralField
 from ..march.intervals import RaySegments, ray_segments
 from ..march.merging import Layer
 from ..march.normals import density_gradient
@@ -72,9 +71,8 @@ class Crossing:
                 keep=keep,
                 stop=whole.settings.stop,
                 tail=-(-block // 2) if exact else None,
-                fuse=not marched.trained,  # which needs the same numbers in all its passes
+                fuse=not exact,
                 emission=emission,
-                thin=not (moving or marched.trained) and isinstance(self.field, NeuralField),
             )
 
     def prepare(self, mode: dr.ADMode) -> None:

@@ -129,10 +129,8 @@ class NerfIntegrator(MarchingIntegrator):
     Images are differentiable with respect to the weights of the fields and their places (the
     medium's ``to_world``, the vertices of its cube), and to whatever the nested integrator
     differentiates, such as colours of surfaces and lights; not with respect to where surfaces
-    or the camera are. Of more than 32768 samples of a field at a time, those of little gradient
-    are drawn at random and stand for the others, without bias. Mitsuba's C++ integrators are
-    differentiated by recording their paths, which takes memory for every bounce;
-    :monosp:`prb` spares that.
+    or the camera are. Mitsuba's C++ integrators are differentiated by recording their paths,
+    which takes memory for every bounce; :monosp:`prb` spares that.
 
     .. tabs::
         .. code-tab:: xml

@@ -12,7 +12,6 @@ import pytest
 from mi_nerf.fields.fourier import FourierEncoding
 from mi_nerf.fields.network import NetworkConfig, initial_weights
 from mi_nerf.fields.neural import NeuralField, NeuralFieldConfig
-from mi_nerf.march import query
 from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.occupancy import OccupancyGrid
 from mi_nerf.march.placing import place_samples
@@ -112,39 +111,6 @@ def test_blocks_and_stored_activations_make_no_difference(ad: Any, block: int, k
     assert any(g.any() for g in expected.values())
     for name, gradient in expected.items():
         assert found[name] == pytest.approx(gradient, rel=1e-10, abs=1e-13), name
-
-
-@pytest.mark.slow
-def test_gradients_of_some_samples_stand_for_all(ad: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """On average over what is drawn, with as little noise as that many more samples would have."""
-    monkeypatch.setattr(query, "_MANY", 0)
-    rng, asked, runs = np.random.default_rng(5), [], 200
-
-    class Counted(Evaluation):
-        def _blocks(self, index: Any, block: int) -> Any:
-            asked.append(len(index))
-            return super()._blocks(index, block)
-
-    monkeypatch.setattr(
-        query, "_mixed", lambda bits: type(bits)(rng.integers(0, 2**32, len(bits), np.uint32))
-    )
-
-    def thinned(field: NeuralField, samples: Samples) -> None:
-        evaluation = Counted(field, samples, 64, thin=True)
-        evaluation.enable_grad()
-        dr.backward(mixed(ad, integrate(evaluation, samples)))
-        evaluation.backward()
-
-    expected, _ = gradients(ad, by_blocks(ad, 64, keep=False))
-    found = [gradients(ad, thinned)[0] for _ in range(runs)]
-    assert np.mean(asked[1::2]) < 0.8 * np.mean(asked[::2])
-    whole = [np.concatenate([g.ravel() for g in f.values()]) for f in (expected, *found)]
-    off = np.mean(whole[1:], axis=0) - whole[0]
-    error = np.std(whole[1:], axis=0, ddof=1) / np.sqrt(runs)
-    z = off[error > 0] / error[error > 0]
-    assert np.abs(z).max() < 5 and z.std() < 1.5
-    assert np.allclose(off[error == 0], 0, atol=1e-12)
-    assert np.linalg.norm(error) * np.sqrt(runs) < np.linalg.norm(whole[0])
 
 
 def test_backward_accumulates(ad: Any) -> None:

@@ -374,15 +374,15 @@ def test_derivatives_end_where_pictures_do(monkeypatch: pytest.MonkeyPatch) -> N
     blob = {"peak": 40.0, "width": 0.3, "extent": 2.5, "radiance": mi.ScalarVector3f(GLOW)}
     changes = {"field.interior_medium.radiance": plus, "field.interior_medium.peak": plus}
     found, queries = [], []
-    for stop in (0.0, 1e-2):
+    for stop in (0.0, 1e-3):
         field = formula_dict("gaussian", place().scale(0.6), **blob)
         scene = scene_of(paths(max_depth=2, stop=stop), floor=floor(), field=field)
         asked.clear()
         found.append(Slopes(scene, changes, pull_of()).backward(1, 4))
         queries.append(sum(asked))
-    assert 0 < queries[1] < 0.8 * queries[0]
+    assert 0 < queries[1] < 0.9 * queries[0]
     key = "field.interior_medium.radiance"
-    assert found[1][key] == pytest.approx(found[0][key], rel=1e-2)
+    assert found[1][key] == pytest.approx(found[0][key], rel=1e-3)
     assert found[1][key] != found[0][key]
     key = "field.interior_medium.peak"
     assert found[1][key] == pytest.approx(found[0][key], rel=5e-2)
