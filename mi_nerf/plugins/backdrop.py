@@ -12,6 +12,7 @@ import mitsuba as mi
 from ..base.color import linear_to_srgb
 from ..base.errors import InputError
 from .colors import CHANNELS, Spectrum, polarized, unpolarized
+from .media import distinct_media
 
 # What may be nested, by name of the class (after a change of variant, Mitsuba may hold a class of
 # its own twice). Each returns the radiance along a ray, knows nothing of other rays, and has
@@ -125,6 +126,7 @@ class Surfaces(Backdrop):
         self._scene, self._integrator = scene, integrator
         self._replayed = _class_name(integrator) in _REPLAYED
         self._paths, self._normals = paths, normals
+        self._media = distinct_media(scene)
 
     def intersect(self, ray: Any) -> Hit:
         """The first surface along the rays."""
@@ -137,12 +139,26 @@ class Surfaces(Backdrop):
         dr.eval(hit.distance, hit.normal)
         return hit
 
-    def shade(self, hit: Hit, ray: Any, sampler: Any, opacity: Any, active: Any = True) -> Light:
-        """What the nested integrator returns for the rays, on average; 0 if not active."""
+    def shade(
+        self,
+        hit: Hit,
+        ray: Any,
+        sampler: Any,
+        opacity: Any,
+        active: Any = True,
+        medium: Any = None,
+    ) -> Light:
+        """What the nested integrator returns for the rays, on average; 0 if not active.
+
+        Args:
+            medium: in which each ray begins; without, in none.
+        """
         total, states, valid = Spectrum(0), [], mi.Bool(False)
         sampler = sampler.clone()
         for _ in range(self._paths):
-            radiance, valid, state = self._sample(dr.ADMode.Primal, ray, sampler, active)
+            radiance, valid, state = self._sample(
+                dr.ADMode.Primal, ray, sampler, active, medium=medium
+            )
             total += radiance
             states.append(state)
             sampler.schedule_state()
@@ -152,7 +168,13 @@ class Surfaces(Backdrop):
         return light
 
     def backward(
-        self, ray: Any, sampler: Any, light: Light, gradients: list[Any], active: Any = True
+        self,
+        ray: Any,
+        sampler: Any,
+        light: Light,
+        gradients: list[Any],
+        active: Any = True,
+        medium: Any = None,
     ) -> None:
         if not self._differentiable():
             return
@@ -163,12 +185,16 @@ class Surfaces(Backdrop):
                 self._sample(dr.ADMode.Backward, ray, sampler, active, pull, state)
             else:
                 with dr.resume_grad(), _differentiable_loops():
-                    radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler, active)
+                    radiance, *_ = self._sample(
+                        dr.ADMode.Backward, ray, sampler, active, medium=medium
+                    )
                     _backward(list(radiance), list(pull))
             sampler.schedule_state()
             dr.eval()
 
-    def forward(self, ray: Any, sampler: Any, light: Light, active: Any = True) -> list[Any]:
+    def forward(
+        self, ray: Any, sampler: Any, light: Light, active: Any = True, medium: Any = None
+    ) -> list[Any]:
         total = dr.zeros(Spectrum, dr.width(ray))
         if not self._differentiable():
             return list(total)
@@ -183,7 +209,9 @@ class Surfaces(Backdrop):
                 total += self._sample(dr.ADMode.Forward, ray, sampler, active, None, state)[0]
             else:
                 with dr.resume_grad(), _differentiable_loops():
-                    radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler, active)
+                    radiance, *_ = self._sample(
+                        dr.ADMode.Forward, ray, sampler, active, medium=medium
+                    )
                     total += Spectrum(*_forward(list(radiance)))
             sampler.schedule_state()
             dr.eval(total)
@@ -210,9 +238,12 @@ class Surfaces(Backdrop):
         active: Any,
         pull: Any = None,
         state: Any = None,
+        medium: Any = None,
     ) -> tuple[Any, Any, Any]:
         """Radiance, validity and state of one path a ray."""
         scene = self._scene
+        if medium is not None:
+            return *self._sample_within(medium, ray, sampler, active), None
         if not self._replayed:
             radiance, valid, _ = self._integrator.sample(scene, sampler, ray, None, active)
             return unpolarized(radiance), valid, None
@@ -228,6 +259,22 @@ class Surfaces(Backdrop):
             active=mi.Bool(active),
         )
         return unpolarized(radiance), valid, state
+
+    def _sample_within(self, medium: Any, ray: Any, sampler: Any, active: Any) -> tuple[Any, Any]:
+        """Radiance and validity of one path a ray, each of which begins in a medium."""
+        if self._replayed:
+            name = _REPLAYED[_class_name(self._integrator)]
+            raise InputError(
+                f"nerf: a field lies within a medium, where nested integrator '{name}' cannot "
+                "begin a path, expected 'volpath' or 'volpathmis'"
+            )
+        radiance, valid = Spectrum(0), mi.Bool(False)
+        for one in self._media:
+            here = active & (medium == mi.MediumPtr(one))
+            found, reached, _ = self._integrator.sample(self._scene, sampler, ray, one, here)
+            radiance += dr.select(here, unpolarized(found), 0)
+            valid |= here & reached
+        return radiance, valid
 
 
 def knows_media(integrator: Any) -> bool:

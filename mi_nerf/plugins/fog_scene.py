@@ -1,7 +1,7 @@
-"""A scene with media of Mitsuba's own, as camera rays find it: fields in front of and behind fog.
+"""A scene with media of Mitsuba's own, as camera rays find it: fields before, behind and in fog.
 
-Along a ray, gaps without any medium follow each other, 0 … n, with media between them, and fields
-are in the gaps alone. Let C_j and O_j be colour and opacity of the fields in gap j, T_j what the
+Along a ray, gaps without any medium follow each other, 0 … n, with media between them. Where
+fields are in the gaps alone, let C_j and O_j be colour and opacity of those in gap j, T_j what the
 media before it let pass, V_j = Π_{i≤j} (1 − O_i) what the fields up to its end do, and X_j what the
 nested integrator returns for the ray from the beginning of the gap on. It knows no fields, so what
 the media j send towards the camera is X_{j−1} − (T_j / T_{j−1}) X_j, and together they show
@@ -11,6 +11,12 @@ the media j send towards the camera is X_{j−1} − (T_j / T_{j−1}) X_j, and 
 
 Each X_j is an estimate of its own and so is T_j where a medium is uneven: the mean is right, a
 single value may be negative. Without media this is C_0 + (1 − O_0) X_0.
+
+A field in a medium has a place at every depth t: with its weights w(t), in the place of the term j
+is V_{j−1} ∫ T(t) w(t) (c(t) − X(t)) dt, where the extinctions of both add up. Here T and X are
+those at one depth, the mean of t under w, of each ray. That is exact for fields that are opaque
+where they begin; else the error is of second order in how much the medium weakens light from the
+front of what is seen of the field to its back. Derivatives hold this depth as it is.
 """
 
 from __future__ import annotations
@@ -21,26 +27,25 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from ..base.errors import InputError
 from ..march.intervals import ray_segments
 from .backdrop import Hit, Light, Surfaces
 from .colors import CHANNELS, Radiance, Spectrum
 from .field_scene import Traced
 from .film import CameraRays, Channels
 from .integral import Seen, pull_back, push_forward, see
-from .media import OVERLAP, Fog, Gap, Passed, Way, find_way, media_of
+from .media import OVERLAP, Fog, Gap, Passed, find_way, media_of
 from .sampled import Rays, SampledField
 
 
 @dataclass(frozen=True)
 class InGap:
-    """What camera rays find in one of their gaps."""
+    """What camera rays find in one of their gaps, or within a medium."""
 
     gap: Gap
     seen: Seen  # of the fields in it
     active: Any  # where it matters what is behind them
-    light: Light  # from the beginning of the gap on
-    passed: Passed | None  # by the media before it; None for the first gap
+    light: Light  # along the gap's ray
+    passed: Passed | None  # by the media before that; None for the first gap
 
     @property
     def outputs(self) -> list[Any]:
@@ -110,21 +115,54 @@ class FogScene:
     def trace(self, camera: CameraRays, *, keep: bool = False) -> TracedInFog:
         """What the rays of a pass see, without derivatives; nothing is kept for these."""
         way = find_way(self._solid, camera.ray)
-        for fog in (fog for fogs in way.fogs for fog in fogs):
-            self._check_apart(fog, camera)
         hit = Hit(way.distance, way.normal)
         random = self._random(camera)
         parts: list[InGap] = []
+        before: list[Fog] = []
         for number, gap in enumerate(way.gaps):
-            seen = see(self._fields, _rays(camera, gap), normals=self._normals)
-            active = gap.there & (seen.opacity > 0)
-            if number and not dr.any(active):
-                continue
-            active = active if number else mi.Bool(True)
-            light = self._surfaces.shade(hit, gap.ray, camera.sampler, seen.opacity, active)
-            passed = self._passed(way, number, camera, active, random) if number else None
-            parts.append(InGap(gap, seen, active, light, passed))
+            part = self._in_gap(hit, gap, before, camera, random, first=number == 0)
+            parts += [] if part is None else [part]
+            for fog in way.fogs[number] if number < len(way.fogs) else ():
+                part = self._in_fog(hit, fog, before, camera, random)
+                parts += [] if part is None else [part]
+                before.append(fog)
         return TracedInFog(camera, hit, parts)
+
+    def _in_gap(
+        self, hit: Hit, gap: Gap, before: list[Fog], camera: CameraRays, random: Any, first: bool
+    ) -> InGap | None:
+        """What is seen in a gap; nothing, unless it is the first, where no field is."""
+        seen = see(self._fields, _rays(camera, gap), normals=self._normals)
+        active = gap.there & (seen.opacity > 0)
+        if not first and not dr.any(active):
+            return None
+        active = mi.Bool(True) if first else active
+        light = self._surfaces.shade(hit, gap.ray, camera.sampler, seen.opacity, active)
+        passed = None if first else Passed([*before], camera.ray, active, random, self._uneven)
+        return InGap(gap, seen, active, light, passed)
+
+    def _in_fog(
+        self, hit: Hit, fog: Fog, before: list[Fog], camera: CameraRays, random: Any
+    ) -> InGap | None:
+        """What is seen of fields within a medium, at their mean depth; nothing where none is."""
+        there = self._shared(fog, camera)
+        if not dr.any(there):
+            return None
+        ray = mi.Ray3f(camera.ray)
+        gap = Gap(fog.start, dr.select(there, fog.end, fog.start), there, ray, fog.medium)
+        seen = see(self._fields, _rays(camera, gap), normals=self._normals)
+        active = there & (seen.opacity > 0)
+        if not dr.any(active):
+            return None
+        at = dr.clip(dr.select(active, seen.values[4], fog.start), fog.start, fog.end)
+        ray.o, ray.maxt = camera.ray(at), camera.ray.maxt - at
+        dr.eval(ray, active, at)
+        light = self._surfaces.shade(
+            hit, ray, camera.sampler, seen.opacity, active, medium=fog.medium
+        )
+        until = Fog(fog.medium, fog.start, at, active)
+        passed = Passed([*before, until], camera.ray, active, random, self._uneven)
+        return InGap(gap, seen, active, light, passed)
 
     def backward(self, traced: TracedInFog, gradients: list[Any]) -> None:
         """Carries the gradients of ``outputs`` to the parameters of the scene."""
@@ -132,8 +170,14 @@ class FogScene:
         for part in traced.parts:
             count = len(part.outputs)
             own, gradients = gradients[:count], gradients[count:]
-            ray, sampler = part.gap.ray, camera.sampler
-            self._surfaces.backward(ray, sampler, part.light, own[5 : 5 + CHANNELS], part.active)
+            self._surfaces.backward(
+                part.gap.ray,
+                camera.sampler,
+                part.light,
+                own[5 : 5 + CHANNELS],
+                part.active,
+                medium=part.gap.medium,
+            )
             if part.passed is not None:
                 part.passed.backward(own[5 + CHANNELS :])
             pull_back(self._fields, _rays(camera, part.gap), own[:5])
@@ -143,18 +187,11 @@ class FogScene:
         camera, slopes = traced.camera, []
         for part in traced.parts:
             slopes += push_forward(self._fields, _rays(camera, part.gap))
-            ray, sampler = part.gap.ray, camera.sampler
-            slopes += self._surfaces.forward(ray, sampler, part.light, part.active)
+            ray, sampler, medium = part.gap.ray, camera.sampler, part.gap.medium
+            slopes += self._surfaces.forward(ray, sampler, part.light, part.active, medium=medium)
             if part.passed is not None:
                 slopes += part.passed.forward()
         return slopes
-
-    def _passed(
-        self, way: Way, number: int, camera: CameraRays, active: Any, random: Any
-    ) -> Passed:
-        """What media let pass as far as a gap."""
-        fogs = [fog for fogs in way.fogs[:number] for fog in fogs]
-        return Passed(fogs, camera.ray, active, random, self._uneven)
 
     def _random(self, camera: CameraRays) -> Any:
         """A generator for each ray, where media are uneven."""
@@ -168,22 +205,15 @@ class FogScene:
         dr.eval(random)
         return random
 
-    def _check_apart(self, fog: Fog, camera: CameraRays) -> None:
-        """Refuses fields in whose boxes there is a medium."""
-        ray = camera.ray
+    def _shared(self, fog: Fog, camera: CameraRays) -> Any:
+        """Which rays cross a field's box within a medium, by more than rounding."""
+        ray, found = camera.ray, mi.Bool(False)
         for marched in self._fields:
             o, d, scale = marched.placed.to_local(ray.o, ray.d)
             whole = ray_segments(marched.field, o, d)
             both = ray_segments(marched.field, o, d, (fog.start * scale, fog.end * scale))
-            shared = both.far - both.near > OVERLAP * (whole.far - whole.near)
-            bad = dr.compress(fog.there & both.hit & shared)
-            if len(bad):
-                medium = dr.gather(mi.MediumPtr, fog.medium, mi.UInt32(bad))[0]
-                names = [shape.id() for shape, held in media_of(self._solid) if held == medium]
-                raise InputError(
-                    f"nerf: the medium of shape '{names[0]}' reaches into the box of the field in "
-                    f"'{marched.placed.shape.id()}', expected media that end before it"
-                )
+            found |= both.hit & (both.far - both.near > OVERLAP * (whole.far - whole.near))
+        return fog.there & found
 
 
 def _rays(camera: CameraRays, gap: Gap) -> Rays:

@@ -18,12 +18,16 @@ OVERLAP = 1e-3  # of a ray's part in a field's box that a medium may share with 
 
 @dataclass(frozen=True)
 class Gap:
-    """What R rays pass between two media, or before the first one: here fields may be."""
+    """What R rays pass between two media, before the first one, or within one.
+
+    Fields are looked for in each of them on its own.
+    """
 
     start: Any  # distances along the camera rays
     end: Any  # of a medium, of a surface, or infinite; the start where a ray has no such gap
     there: Any  # whether it has
-    ray: Any  # from the start on, as far as anything reaches
+    ray: Any  # from where what is behind the fields counts: the start, or their place in a medium
+    medium: Any = None  # in which that is, of each ray
 
 
 @dataclass(frozen=True)
@@ -54,6 +58,15 @@ def media_of(scene: mi.Scene) -> list[tuple[Any, Any]]:
         for medium in (shape.interior_medium(), shape.exterior_medium())
         if medium is not None and not is_field(medium)
     ]
+
+
+def distinct_media(scene: mi.Scene) -> list[Any]:
+    """Media other than fields, each of them once."""
+    found: list[Any] = []
+    for _, medium in media_of(scene):
+        if not any(medium is other or medium == other for other in found):
+            found.append(medium)
+    return found
 
 
 def find_way(scene: mi.Scene, ray: Any) -> Way:

@@ -17,6 +17,7 @@ from .marching import MarchingIntegrator
 from .media import media_of
 from .placement import find_fields
 from .solid_scene import SolidScene, has_surfaces
+from .wanted_gradients import check_gradients
 
 # Camera rays up to which a picture of fields in training keeps what its derivatives need.
 _BATCH = 1 << 14
@@ -68,7 +69,7 @@ class NerfIntegrator(MarchingIntegrator):
        - |float|
        - A ray ends where a field lets pass less than this share of the light behind, which
          changes the opacity by less than it, and a colour by less than it times the largest
-         radiance. Derivatives always take all samples. 0 switches it off.
+         radiance; derivatives end there, too. 0 switches it off.
          (Default: what the field file suggests, 1e-3 as trained)
      * - jitter
        - |bool|
@@ -107,12 +108,14 @@ class NerfIntegrator(MarchingIntegrator):
     cubes, so fields cast no shadows and are missing in mirrors; :monosp:`nerf_path` has both. What
     is seen through a surface that is not opaque is likewise without fields.
 
-    Media of Mitsuba's own, homogeneous or heterogeneous, may stand beside the fields where
+    Media of Mitsuba's own, homogeneous or heterogeneous, may stand beside fields where
     :monosp:`volpath`, :monosp:`volpathmis` or :monosp:`prbvolpath` is nested: what lies behind
     them is weakened by them, what they scatter towards the camera by the fields before them
-    (:py:mod:`mi_nerf.plugins.fog_scene`). They are not lit or shaded by fields. They end where the
-    box of a field begins, in shapes with the BSDF :monosp:`null`. A ray that comes to a field
-    through fog asks the nested integrator twice, and a single sample may be negative there.
+    (:py:mod:`mi_nerf.plugins.fog_scene`). They are not lit or shaded by fields. Their shapes have
+    the BSDF :monosp:`null`. A ray that comes to a field through fog asks the nested integrator
+    twice, and a single sample may be negative there. With :monosp:`volpath` or
+    :monosp:`volpathmis`, media may reach into the boxes of fields or surround them: both weaken
+    light there, and along each ray the field counts at its mean depth in the medium.
 
     The alpha channel of an RGBA film is the opacity of the fields; with a nested integrator,
     its alpha channel with the fields in front. The colour of a field trained on sRGB images is
@@ -170,6 +173,16 @@ class NerfIntegrator(MarchingIntegrator):
                 )
             check_nested(nested)
         return found[0] if found else None
+
+    def render_backward(self, scene: mi.Scene, *args: Any, **options: Any) -> None:
+        """Carries the gradient of an image to the parameters; see :class:`FieldIntegrator`."""
+        check_gradients(scene, self.plugin)
+        super().render_backward(scene, *args, **options)
+
+    def render_forward(self, scene: mi.Scene, *args: Any, **options: Any) -> Any:
+        """The derivative of an image along the gradients of the scene's parameters."""
+        check_gradients(scene, self.plugin)
+        return super().render_forward(scene, *args, **options)
 
     def traverse(self, callback: Any) -> None:
         """Exposes the nested integrator."""

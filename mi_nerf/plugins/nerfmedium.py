@@ -192,7 +192,7 @@ class NerfMedium(mi.Medium):
             self.field = closed_form(self._source, values, mi.TensorXf)
         except ValueError as error:
             raise InputError(f"nerfmedium: {error}") from error
-        self.march = MarchSettings(samples=128)
+        self.march = MarchSettings(samples=128, block=1 << 17)  # of formulas, large ones are quick
 
     @property
     def occupancy(self) -> Any:
@@ -238,20 +238,26 @@ class NerfMedium(mi.Medium):
 
     def traverse(self, callback: Any) -> None:
         """Exposes every tensor of the network, and ``to_world``, as differentiable parameters."""
-        parameters = self.field.parameters()
-        for public, name in self._names.items():
-            callback.put(public, parameters[name], mi.ParamFlags.Differentiable)
-        if self.field.coarse is not None:
-            parameters = self.field.coarse.parameters()
-            for public, name in self._names.items():
-                callback.put(f"coarse_{public}", parameters[name], mi.ParamFlags.Differentiable)
+        for public, tensor in self._tensors().items():
+            callback.put(public, tensor, mi.ParamFlags.Differentiable)
         callback.put("to_world", self.to_world, mi.ParamFlags.Differentiable)
+
+    def _tensors(self) -> dict[str, Any]:
+        """The parameters of the field and of its coarse network, by their public names."""
+        fields = {"": self.field}
+        if self.field.coarse is not None:
+            fields["coarse_"] = self.field.coarse
+        return {
+            prefix + public: field.parameters()[name]
+            for prefix, field in fields.items()
+            for public, name in self._names.items()
+        }
 
     def parameters_changed(self, keys: list[str] | None = None) -> None:
         """New weights may fill cells that were empty: the next picture looks at them again."""
         changed = not keys or any(k in self._names for k in keys)
         self._stale |= changed
-        self._checked &= not changed
+        self._checked &= not changed and not any(k.startswith("coarse_") for k in keys or ())
 
     def check_finite(self) -> None:
         """Refuses weights that would turn the whole picture into NaN.
@@ -261,14 +267,14 @@ class NerfMedium(mi.Medium):
         """
         if self._checked:
             return
-        parameters = self.field.parameters()
-        bad = dr.zeros(mi.UInt32, len(parameters))
+        tensors = self._tensors()
+        bad = dr.zeros(mi.UInt32, len(tensors))
         dr.make_opaque(bad)
-        for i, name in enumerate(self._names.values()):
-            values = dr.detach(parameters[name])
+        for i, tensor in enumerate(tensors.values()):
+            values = dr.detach(tensor)
             values = values.array if dr.is_tensor_v(values) else dr.ravel(values)
             dr.scatter(bad, mi.UInt32(1), dr.opaque(mi.UInt32, i), ~dr.isfinite(values))
-        wrong = [name for name, b in zip(self._names, np.array(bad), strict=True) if b]
+        wrong = [name for name, b in zip(tensors, np.array(bad), strict=True) if b]
         if wrong:
             raise InputError(
                 f"nerfmedium: '{self.id()}': {', '.join(wrong)}: NaN or infinite, "

@@ -1,12 +1,15 @@
 """Where the derivatives of light paths go: to parameters, or from them to an image.
 
 Both modes are told the same: which arrays, or which fields along which rays, have brought light
-to which camera rays. Each piece is differentiated at once and forgotten.
+to which camera rays. Each piece is differentiated and forgotten: at once, or with others that
+are alike, for fields are asked at little more cost about many rays than about few.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from typing import Any
 
 import drjit as dr
@@ -18,6 +21,9 @@ from .integral import Integral, chunks
 from .path_state import gather
 from .sampled import Rays, SampledField
 
+# Samples on rays that wait to be differentiated together; as many as are marched at once.
+_WAITING = 1 << 18
+
 
 class Derivatives(ABC):
     """Of the radiance that camera rays gather, piece by piece."""
@@ -26,7 +32,15 @@ class Derivatives(ABC):
 
     def __init__(self, fields: list[SampledField]) -> None:
         self._fields = fields
-        self._moving = [field for field in fields if field.differentiable]
+        moving = [field for field in fields if field.differentiable]
+        self._seen = _Queue(fields, self._differentiate_seen) if moving else None
+        self._passed = [_Queue([field], self._differentiate_passed) for field in moving]
+
+    def finish(self) -> None:
+        """Differentiates what has been waiting."""
+        for queue in (self._seen, *self._passed):
+            if queue is not None:
+                queue.flush()
 
     @abstractmethod
     def carry(self, slot: Any, value: Any, leaves: list[Any]) -> None:
@@ -42,24 +56,28 @@ class Derivatives(ABC):
         Args:
             weight, behind: N colours.
         """
-        if not self._moving:
-            return
-        behind = behind + dr.zeros(Spectrum, len(slot))
-        for index, part in chunks(self._fields, rays):
-            integral = Integral(self._fields, part, self.mode)
-            own = gather(slot, index)
-            own_weight, own_behind = gather(weight, index), gather(behind, index)
-            self._see(own, own_weight, own_behind, integral, part.wavelengths)
+        if self._seen is not None:
+            self._seen.add(slot, rays, weight, behind + dr.zeros(Spectrum, len(slot)))
 
     def pass_through(self, slot: Any, rays: Rays, light: Any) -> None:
         """Of what fields let pass: of N colours ``light``, which they have weakened already."""
-        for field in self._moving:
-            for index, part in chunks([field], rays):
-                for crossing in crossings([field], part, self.mode, emission=False):
-                    with dr.resume_grad():
-                        crossing.prepare(self.mode)
-                        depth = crossing.optical_depth()
-                    self._weaken(gather(slot, index), gather(light, index), crossing, depth)
+        for queue in self._passed:
+            queue.add(slot, rays, light)
+
+    def _differentiate_seen(
+        self, marched: list[SampledField], slot: Any, rays: Rays, weight: Any, behind: Any
+    ) -> None:
+        integral = Integral(marched, rays, self.mode)
+        self._see(slot, weight, behind, integral, rays.wavelengths)
+
+    def _differentiate_passed(
+        self, marched: list[SampledField], slot: Any, rays: Rays, light: Any
+    ) -> None:
+        for crossing in crossings(marched, rays, self.mode, emission=False):
+            with dr.resume_grad():
+                crossing.prepare(self.mode)
+                depth = crossing.optical_depth()
+            self._weaken(slot, light, crossing, depth)
 
     @abstractmethod
     def _see(
@@ -142,3 +160,62 @@ class Push(Derivatives):
     def _add(self, slot: Any, tangent: Any) -> None:
         dr.scatter_add(self.tangent, tangent, slot)
         dr.eval(self.tangent)
+
+
+class _Queue:
+    """Pieces of paths that cross fields, until there are enough to differentiate them."""
+
+    def __init__(self, marched: list[SampledField], differentiate: Callable[..., None]) -> None:
+        """
+        Args:
+            differentiate: takes the fields, and N camera rays, pieces and colours of each.
+        """
+        self._fields, self._differentiate = marched, differentiate
+        samples = sum(field.march.samples + field.march.fine for field in marched)
+        self._most = max(1, _WAITING // samples)
+        self._waiting: list[tuple[Any, ...]] = []
+        self._count = 0
+
+    def add(self, slot: Any, rays: Rays, *colors: Any) -> None:
+        """More of them; those that cross no field, or whose colours are all 0, are left out."""
+        strength = sum((dr.max(dr.abs(color)) for color in colors), mi.Float(0))
+        matters = mi.UInt32(dr.compress(strength != 0))
+        if not len(matters):
+            return
+        part = rays.take(matters)
+        for index, crossing in chunks(self._fields, part, whole=True):
+            own = gather(matters, index)
+            piece = (gather(slot, own), crossing, *(gather(color, own) for color in colors))
+            dr.eval(piece)
+            if self._count + len(index) > self._most:
+                self.flush()
+            self._waiting.append(piece)
+            self._count += len(index)
+
+    def flush(self) -> None:
+        """Differentiates all that wait."""
+        if not self._waiting:
+            return
+        slot, rays, *colors = (_joined(values) for values in zip(*self._waiting, strict=True))
+        self._waiting, self._count = [], 0
+        for index, part in chunks(self._fields, rays):
+            own = [gather(color, index) for color in colors]
+            self._differentiate(self._fields, gather(slot, index), part, *own)
+
+
+def _joined(values: Sequence[Any]) -> Any:
+    """Arrays, or rays, one after the other; ``dr.concat`` would compile kernels for lengths."""
+    first = values[0]
+    if len(values) == 1 or first is None or not dr.width(first):  # rgb has no wavelengths
+        return first
+    if isinstance(first, Rays):
+        parts = {f.name: [getattr(value, f.name) for value in values] for f in fields(Rays)}
+        return Rays(**{name: _joined(part) for name, part in parts.items()})
+    total, start = dr.zeros(type(first), sum(map(dr.width, values))), 0
+    dr.make_opaque(total)
+    for value in values:
+        count = dr.width(value)
+        dr.scatter(total, value, dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start))
+        start += count
+    dr.eval(total)
+    return total

@@ -15,10 +15,14 @@ is still to come, and by the product rule
 so that every vertex and every segment is differentiated on its own and forgotten. Memory does
 not grow with the number of bounces. How paths are sampled is not differentiated, nor where
 surfaces are.
+
+The second time, fields need not be asked again what they show: the first numbers of that, four
+a segment, are kept, so many a camera ray and no more, however long the paths are.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import drjit as dr
@@ -33,6 +37,9 @@ from .vertex import Surroundings
 # Behind fields that let less pass, the rest is left out: divided by so little, it would be
 # nothing but rounding. What is lost is as small, relative to the light behind.
 _LEAST_PASSING = 1e-4
+
+# Segments and connections, for each camera ray on average, of which is kept what fields show.
+_KEPT_A_RAY = 32
 
 
 class Colors:
@@ -72,19 +79,48 @@ class Colors:
             return value + fields.light * vertex.shone
 
 
+class Recording(Image):
+    """What camera rays gather, and what fields show to their paths meanwhile."""
+
+    def __init__(self, rays: int, paths: int, colors: Colors) -> None:
+        """
+        Args:
+            paths: of each ray, every one of which has a recording of its own.
+        """
+        super().__init__(rays)
+        self.every_connection = bool(colors.wanted)  # as in the replay
+        self.kept: list[Any] = []  # in order; ``None`` for what was not kept
+        self._room = _KEPT_A_RAY * rays // paths
+
+    def shown(self, find: Callable[[], Any]) -> Any:
+        found = find()
+        dr.eval(found)
+        self._room -= dr.width(found)
+        self.kept.append(found if self._room >= 0 else None)
+        return found
+
+
 class Replay(Image):
     """What is left of the radiance of camera rays, while their paths are followed again."""
 
-    def __init__(self, radiance: Any, colors: Colors, derivatives: Derivatives) -> None:
+    def __init__(
+        self, radiance: Any, shown: list[Any], colors: Colors, derivatives: Derivatives
+    ) -> None:
         """
         Args:
             radiance: what the paths have brought in all.
+            shown: what a :class:`Recording` has kept.
             derivatives: where derivatives go.
         """
-        self.radiance = Spectrum(radiance)
+        self.radiance, self._shown = Spectrum(radiance), iter(shown)
         self._colors, self._derivatives = colors, derivatives
         # A lamp of no power brings no light, but has a derivative.
         self.every_connection = bool(colors.wanted)
+
+    def shown(self, find: Callable[[], Any]) -> Any:
+        """What was kept of it, or else the same once more."""
+        kept = next(self._shown)
+        return find() if kept is None else kept
 
     def add(self, slot: Any, radiance: Any) -> None:
         """Takes away, of some of the rays, what was added to them."""

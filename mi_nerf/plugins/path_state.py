@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -42,6 +43,10 @@ class Image:
     def add(self, slot: Any, radiance: Any) -> None:
         """Adds to some of the rays, each named once."""
         dr.scatter_add(self.radiance, radiance, slot)
+
+    def shown(self, find: Callable[[], Any]) -> Any:
+        """What fields show to paths, arrays; ``find`` asks them."""
+        return find()
 
     def cover(self, slot: Any, alpha: Any) -> None:
         """Makes some of the rays more opaque."""

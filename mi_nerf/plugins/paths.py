@@ -15,7 +15,7 @@ from .colors import Spectrum
 from .field_light import FieldLight
 from .integral import see, transmittance
 from .path_derivatives import Derivatives, Pull, Push
-from .path_replay import Colors, Replay
+from .path_replay import Colors, Recording, Replay
 from .path_state import (
     Chance,
     Connections,
@@ -44,6 +44,7 @@ class Followed:
     first: Ends
     slot: Any  # the camera rays that were followed
     radiance: Any  # R colours: what the paths have brought
+    shown: list[Any]  # what fields have shown to them, in order, as far as that was kept
 
 
 class PathsBehind(Backdrop):
@@ -95,13 +96,14 @@ class PathsBehind(Backdrop):
         sampler = sampler.clone()
         going = dr.compress(1 - opacity > settings.stop) if settings.max_depth else mi.UInt32()
         for _ in range(settings.paths):
-            image, slot = Image(dr.width(hit.distance)), mi.UInt32(going)
+            slot = mi.UInt32(going)
+            image = self._recording(dr.width(hit.distance))
             self._follow(hit.ends, slot, sampler, image)
             total.radiance += image.radiance
             total.alpha += image.alpha
             total.evaluate()
-            if settings.keep:
-                states.append(Followed(hit.ends, slot, image.radiance))
+            if isinstance(image, Recording):
+                states.append(Followed(hit.ends, slot, image.radiance, image.kept))
         radiance = list(total.radiance * (1 / settings.paths))
         valid = dr.fmin(total.alpha * (1 / settings.paths), 1)
         if not settings.hide_lights and self._scene.environment() is not None:
@@ -120,13 +122,20 @@ class PathsBehind(Backdrop):
         self._replay(sampler, light, push)
         return list(push.tangent * (1 / self._settings.paths))
 
+    def _recording(self, rays: int) -> Image:
+        """For what one path for each of R rays brings."""
+        if not self._settings.keep:
+            return Image(rays)
+        return Recording(rays, self._settings.paths, Colors(self._around))
+
     def _replay(self, sampler: Any, light: Light, derivatives: Derivatives) -> None:
         """Follows the paths that :meth:`shade` has followed, with the same random numbers."""
         sampler = sampler.clone()
         colors = Colors(self._around)
         for state in light.states:
-            replay = Replay(state.radiance, colors, derivatives)
+            replay = Replay(state.radiance, state.shown, colors, derivatives)
             self._follow(state.first, state.slot, sampler, replay)
+        derivatives.finish()
 
     def _behind_lights(self, ray: Any, pi: Any) -> tuple[Any, Any]:
         """The rays behind the light sources that they hit first, and what these meet."""
@@ -181,15 +190,15 @@ class PathsBehind(Backdrop):
                 Rays(paths.o, paths.d, pi.t, jitter, wavelengths=paths.wavelengths),
                 self._around.fields,
             )
-            seen = see(self._fields, rays)
+            color, opacity = image.shown(lambda: self._seen(rays))
             share = mi.Float(1)
             if lights.boxes:
                 pdf = lights.pdf(paths.vertex, paths.d)
                 share = dr.select(paths.delta, 1, mis_weight(paths.pdf, pdf))
             weight = paths.throughput * share
-            image.add(paths.slot, weight * seen.color)
-            image.cover(paths.slot, paths.transmittance * seen.opacity)
-            through = 1 - seen.opacity
+            image.add(paths.slot, weight * color)
+            image.cover(paths.slot, paths.transmittance * opacity)
+            through = 1 - opacity
             through = dr.select(through > dr.opaque(mi.Float, self._settings.stop), through, 0)
             paths.throughput *= through
             paths.transmittance *= through
@@ -197,6 +206,11 @@ class PathsBehind(Backdrop):
             image.evaluate()
             image.passed(paths.slot, rays, weight, through)
         return Ends(ray, pi)
+
+    def _seen(self, rays: Rays) -> tuple[Any, Any]:
+        """Colour and opacity of the fields along rays."""
+        seen = see(self._fields, rays)
+        return seen.color, seen.opacity
 
     def _bounce(
         self, paths: Paths, ends: Ends, depth: int, chance: Chance, image: Image
@@ -240,7 +254,9 @@ class PathsBehind(Backdrop):
         passing = dr.zeros(mi.Float, len(slot))
         if not len(lit):
             return passing
-        through = transmittance(self._fields, rays) if self._fields else dr.ones(mi.Float, len(lit))
+        through = dr.ones(mi.Float, len(lit))
+        if self._fields:
+            (through,) = image.shown(lambda: (transmittance(self._fields, rays),))
         slot = gather(slot, lit)
         image.add(slot, light * through)
         dr.scatter(passing, through, lit)
@@ -262,7 +278,7 @@ class PathsBehind(Backdrop):
         first = mi.Ray3f(rays.o, rays.d)
         rays.reach = self._scene.ray_intersect_preliminary(first, coherent=False).t
         dr.eval(rays.reach)
-        color, slot = see(self._fields, rays).color, gather(slot, lit)
+        (color, _), slot = image.shown(lambda: self._seen(rays)), gather(slot, lit)
         image.add(slot, weight * color)
         dr.scatter(shone, color, lit)
         dr.eval(shone, slot)

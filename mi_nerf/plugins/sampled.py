@@ -46,8 +46,11 @@ class SampledField:
 
     @property
     def differentiated(self) -> MarchedField:
-        """The field for derivatives: its rays do not end, but for what training leaves out."""
-        settings = replace(self.march, stop=0.0, hidden=self.placed.medium.hidden)
+        """The field for derivatives: rays end where those of pictures do, or as in training."""
+        medium = self.placed.medium
+        if not medium.training:
+            return self.marched
+        settings = replace(self.march, stop=0.0, hidden=medium.hidden)
         return replace(self.marched, settings=settings)
 
     def walk(self, rays: Rays, *, emission: bool = True) -> tuple[Walked, Any]:

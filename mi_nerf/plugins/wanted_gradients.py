@@ -1,4 +1,4 @@
-"""Which parameters of a scene light paths can be differentiated by; refuses the others."""
+"""Which parameters of a scene pictures can be differentiated by; refuses the others."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from ..base.errors import InputError
 from .placement import is_field
@@ -17,15 +18,15 @@ _EXPECTED = (
 
 
 def check_gradients(scene: mi.Scene, plugin: str) -> None:
-    """Refuses gradients of what has none in light paths.
+    """Refuses gradients of what has none, and by what is no number.
 
     Raises:
         InputError: naming the parameter.
     """
     params = mi.traverse(scene)
     with dr.resume_grad():
-        wanted = [key for key, value in params if dr.grad_enabled(value)]
-    for key in wanted:
+        wanted = [(key, value) for key, value in params if dr.grad_enabled(value)]
+    for key, _ in wanted:
         parent, flags = _parent(params, key), int(params.flags(key))
         if isinstance(parent, mi.Shape):
             refused = not is_field(parent.interior_medium())
@@ -39,6 +40,14 @@ def check_gradients(scene: mi.Scene, plugin: str) -> None:
             raise InputError(
                 f"{plugin}: the gradient of '{key}' is wanted, but there is no derivative {what}: "
                 f"{_EXPECTED}"
+            )
+    # Those of fields have been looked at before.
+    others = [(key, value) for key, value in wanted if not is_field(_parent(params, key))]
+    for key, value in others:
+        numbers = dr.detach(value.matrix if isinstance(value, mi.Transform4f) else value)
+        if not np.isfinite(np.array(numbers)).all():
+            raise InputError(
+                f"{plugin}: '{key}' is NaN or infinite, expected finite numbers to differentiate by"
             )
 
 

@@ -112,6 +112,22 @@ def test_a_change_of_the_coarse_network_moves_the_samples(pair: Path) -> None:
     assert 1e-4 < np.abs(after - before).max() < 0.2
 
 
+def test_a_coarse_network_that_is_not_finite_is_refused(pair: Path) -> None:
+    """It only places samples, but NaN leaves none."""
+    scene = mi.load_dict(scene_dict(pair, spp=1, integrator={"fine": FINE}))
+    params, key = mi.traverse(scene), "box.interior_medium.coarse_density_bias"
+    good = np.array(params[key])
+    mi.render(scene)
+    params[key] = mi.TensorXf(np.full_like(good, np.nan))
+    params.update()
+    with pytest.raises(RuntimeError) as caught:
+        mi.render(scene)
+    assert "coarse_density_bias: NaN or infinite" in str(caught.value.__cause__ or caught.value)
+    params[key] = mi.TensorXf(good)
+    params.update()
+    assert np.isfinite(np.array(mi.render(scene))).all()
+
+
 def test_what_is_refused(pair: Path, tmp_path: Path) -> None:
     alone = {"type": "scene", "sensor": {"type": "perspective"}, "box": slab(place(), 1.0, GLOW)}
     for options, message in (

@@ -292,6 +292,26 @@ def test_light_of_a_box_agrees_with_the_derivative_of_its_closed_form(sampled: b
     assert seen[keys[1]] == pytest.approx(radiance, rel=3e-2)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("mirrored", ["conductor", "dielectric"])
+def test_how_much_of_a_blend_is_a_mirror(mirrored: str) -> None:
+    """Pictures are linear in the weight of a blend: the derivative is that between its ends."""
+    matt = {"type": "diffuse", "reflectance": rgb((0.1, 0.1, 0.1))}
+    blend = {"type": "blendbsdf", "weight": 0.4, "first": matt, "second": {"type": mirrored}}
+    sky = {"type": "constant", "radiance": rgb((1.3, 1.2, 1.1))}
+    field = slab(place().translate([0, 0.5, 0.2]).scale(0.5), 2.0, GLOW)
+    objects = {"floor": {**floor(), "bsdf": blend}, "sky": sky, "field": field}
+    objects["light"] = point_light((0.2, 0.1, 2.5))
+    key = "floor.bsdf.weight.value"
+    slopes = Slopes(scene_of(paths(max_depth=2), **objects), {key: plus}, pull_of())
+    found = np.array([slopes.backward(seed, 64)[key] for seed in range(1, 5)])
+    ends = [[slopes.value(key, x, seed, 64) for seed in range(11, 15)] for x in (0.6, -0.4)]
+    expected = np.subtract(*ends)
+    error = np.hypot(found.std(ddof=1), expected.std(ddof=1)) / 2
+    assert abs(found.mean() - expected.mean()) < 4 * error
+    assert error < 0.02 * abs(expected.mean())
+
+
 # ---- Replay ---------------------------------------------------------------------
 
 
@@ -321,6 +341,64 @@ def test_a_replay_takes_away_all_that_a_path_has_brought(
     for replay in replays:
         assert replay.before.max() > 0.1
         np.testing.assert_allclose(np.array(replay.radiance), 0, atol=2e-6 * replay.before.max())
+
+
+@pytest.mark.slow
+def test_neither_what_is_kept_nor_what_waits_changes_a_derivative(
+    slopes: Slopes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fields are asked again where nothing is kept, and about few rays where nothing waits."""
+    from mi_nerf.plugins import path_derivatives, path_replay
+    from mi_nerf.plugins import paths as module
+
+    asked: list[str] = []
+    for name in ("see", "transmittance"):
+        ask = getattr(module, name)
+        monkeypatch.setattr(
+            module, name, lambda *a, ask=ask, name=name: (asked.append(name), ask(*a))[1]
+        )
+    kept = slopes.backward(5, 4)
+    once, asked[:] = len(asked) / 2, []  # for the picture, and once more for its derivative
+    monkeypatch.setattr(path_replay, "_KEPT_A_RAY", 0)
+    again = slopes.backward(5, 4)
+    assert len(asked) == 3 * once > 0
+    monkeypatch.setattr(path_derivatives, "_WAITING", 1)
+    single = slopes.backward(5, 4)
+    for key, gradient in kept.items():
+        assert again[key] == pytest.approx(gradient, rel=1e-4), key
+        assert single[key] == pytest.approx(gradient, rel=1e-3), key
+
+
+@pytest.mark.slow
+def test_derivatives_end_where_pictures_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a share ``stop`` of light, no sample is asked; what is lost is no more than that."""
+    from mi_nerf.march import query
+    from mi_nerf.plugins import crossing
+
+    asked: list[int] = []
+
+    class Counted(query.Evaluation):
+        def backward(self) -> None:
+            asked.append(len(self.asked))
+            super().backward()
+
+    monkeypatch.setattr(crossing, "Evaluation", Counted)
+    monkeypatch.setattr(query, "_LEAST_QUERIES", 64)  # so few rays would be asked about at once
+    blob = {"peak": 40.0, "width": 0.3, "extent": 2.5, "radiance": mi.ScalarVector3f(GLOW)}
+    changes = {"field.interior_medium.radiance": plus, "field.interior_medium.peak": plus}
+    found, queries = [], []
+    for stop in (0.0, 1e-3):
+        field = formula_dict("gaussian", place().scale(0.6), **blob)
+        scene = scene_of(paths(max_depth=2, stop=stop), floor=floor(), field=field)
+        asked.clear()
+        found.append(Slopes(scene, changes, pull_of()).backward(1, 4))
+        queries.append(sum(asked))
+    assert 0 < queries[1] < 0.9 * queries[0]
+    key = "field.interior_medium.radiance"
+    assert found[1][key] == pytest.approx(found[0][key], rel=1e-3)
+    assert found[1][key] != found[0][key]
+    key = "field.interior_medium.peak"
+    assert found[1][key] == pytest.approx(found[0][key], rel=5e-2)
 
 
 @pytest.mark.slow
@@ -385,6 +463,19 @@ def test_memory_grows_neither_with_depth_nor_with_samples() -> None:
 # ---- What has none --------------------------------------------------------------
 
 
+def test_derivatives_by_colors_that_are_no_numbers_are_refused() -> None:
+    objects = {"floor": floor(), "light": point_light((0, 0, 2.0)), "box": formula_dict("slab")}
+    for integrator in (paths(), {"type": "nerf", "nested": {"type": "path"}}):
+        scene = mi.load_dict(scene_of(integrator, **objects))
+        params, key = mi.traverse(scene), "floor.bsdf.reflectance.value"
+        params[key] = mi.Color3f(np.nan)
+        dr.enable_grad(params[key])
+        params.update()
+        with pytest.raises(mi_nerf.InputError, match=f"'{key}' is NaN or infinite, expected"):
+            dr.backward(mi.render(scene, params))
+
+
+@pytest.mark.parametrize("kind", ["nerf", "nerf_path"])
 @pytest.mark.parametrize(
     ("key", "what"),
     [
@@ -394,13 +485,14 @@ def test_memory_grows_neither_with_depth_nor_with_samples() -> None:
         ("sensor.x_fov", "of a sensor"),
     ],
 )
-def test_what_has_no_derivative_is_refused(key: str, what: str) -> None:
+def test_what_has_no_derivative_is_refused(key: str, what: str, kind: str) -> None:
     objects = {"floor": floor(), "light": point_light((0, 0, 2.0)), "box": formula_dict("slab")}
-    scene = mi.load_dict(scene_of(paths(), **objects))
+    integrator = paths() if kind == "nerf_path" else {"type": "nerf", "nested": {"type": "path"}}
+    scene = mi.load_dict(scene_of(integrator, **objects))
     params = mi.traverse(scene)
     params[key] = type(params[key])(params[key])
     dr.enable_grad(params[key])
     params.update()
-    expected = f"nerf_path: the gradient of '{key}' is wanted, but there is no derivative {what}: "
+    expected = f"{kind}: the gradient of '{key}' is wanted, but there is no derivative {what}: "
     with pytest.raises(mi_nerf.InputError, match=expected):
         dr.backward(mi.render(scene, params))
