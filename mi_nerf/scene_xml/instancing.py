@@ -4,8 +4,8 @@ Mitsuba compiles code of its own for every instance of a shape group, and bounds
 ones loosely. Copies of meshes merge into one mesh: a tree of 213 instanced sprays compiles
 in 1.3 s instead of 16 s that way, and renders in two thirds of the time. Memory grows with
 the copies, so scenes of very many instances stay as they are; so do instances whose place
-a copy cannot take. Where a mesh with vertex normals is stretched, the normals between vertices
-differ a little, as they are given their length again before they are interpolated, not after.
+a copy cannot take. Where a smooth mesh is stretched, the normals between its vertices differ a
+little: they are found and interpolated after the stretch, not before.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ def files_of(state: Any) -> list[Path]:
     import mitsuba as mi
 
     files = [Path(str(file)) for file in state.files]
-    for name, value in _properties(state):
+    for name, _, value in _properties(state):
         if isinstance(value, str):
             found = Path(str(mi.file_resolver().resolve(value)))
             if name == "filename" or (_looks_like_a_file(value) and found.is_file()):
@@ -50,32 +50,33 @@ def digest(state: Any, parameters: Mapping[str, str]) -> str:
         total.update(f"{name}={value}\n".encode())
     for file in files_of(state):
         total.update(_digest_of(file))
-    for name, value in _properties(state):
-        if (told := _told(value)) is not None:
+    for name, kind, value in _properties(state):
+        if (told := _told(kind, value)) is not None:
             total.update(json.dumps([name, told]).encode())
     return total.hexdigest()
 
 
-def _properties(state: Any) -> Iterator[tuple[str, Any]]:
-    """Names and values of all that is set in a scene."""
+def _properties(state: Any) -> Iterator[tuple[str, Any, Any]]:
+    """Names, types and values of all that is set in a scene."""
     for node in state.nodes:
         for key in node.props.keys():  # noqa: SIM118
-            yield key, node.props[key]
+            yield key, node.props.type(key), node.props[key]
 
 
-def _told(value: Any) -> Any:
+def _told(kind: Any, value: Any) -> Any:
     """A value as JSON knows it, the same on every machine; ``None`` for references."""
     import mitsuba as mi
 
-    if isinstance(value, bool | int | float | str):
+    types = mi.Properties.Type
+    if kind in (types.Bool, types.Integer, types.Float, types.String):
         return value
-    if isinstance(value, mi.Properties.Reference | mi.Properties.ResolvedReference):
-        return None
-    if hasattr(value, "wavelengths"):
+    if kind in (types.Vector, types.Color):
+        return [float(number) for number in value]
+    if kind == types.Spectrum:
         return [list(value.wavelengths), list(value.values)]
-    if hasattr(value, "matrix"):
+    if kind == types.Transform:
         return [f"{number:.{_DIGITS}g}" for number in np.ravel(value.matrix)]
-    return [float(number) for number in value]  # a vector or a colour
+    return None
 
 
 def _looks_like_a_file(value: str) -> bool:

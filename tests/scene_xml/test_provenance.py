@@ -17,7 +17,8 @@ from tests.support import gallery
 CONTENT = """<default name="size" value="0.4"/><path value="spectra"/>
     <include filename="parts/ball.xml"/><include filename="parts/defaults.xml"/>
     <emitter type="envmap"><string name="filename" value="sky.exr"/></emitter>
-    <emitter type="point"><point name="position" value="$x 0 $x"/><spectrum name="intensity" filename="gold.k.spd"/></emitter>
+    <emitter type="point"><point name="position" value="$x 0 $x"/>
+        <spectrum name="intensity" filename="gold.k.spd"/></emitter>
     <shape type="obj"><string name="filename" value="wedge.obj"/><bsdf type="diffuse">
         <texture type="bitmap" name="reflectance">
             <string name="filename" value="textures/paint.png"/></texture></bsdf></shape>
