@@ -133,7 +133,9 @@ class _Comparison:
         if surfaces is not None:
             figures |= self._surface_figures(k, surfaces)
         if k in self._kept:
-            whole = [np.rint(255 * image).astype(np.uint8) for image in (picture, truth)]
+            # NaN is black here: the figures of pictures say that it is there.
+            numbers = (np.nan_to_num(255 * image) for image in (picture, truth))
+            whole = [np.rint(image).astype(np.uint8) for image in numbers]
             self._kept[k] = (whole[0], whole[1], surfaces)
         self.figures.append(figures)
         return picture

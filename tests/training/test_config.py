@@ -105,6 +105,7 @@ def test_all_names_can_be_assigned() -> None:
         "sampling.far": "9",
         "sampling.render_fine": "7",
         "views": "5",
+        "images": "exr",
         "grid.finest": "99",
     }
     config = with_settings(TrainConfig(), ["position.frequencies=10", "grid.levels=8"])

@@ -59,7 +59,7 @@ def test_radiance_is_learnt_from_radiance(lamp: Path, tmp_path: Path) -> None:
     assert 20 < np.median(view.color[bright][:, 0]) < 80
     dark = (truth[..., 3] > 0.99) & (truth[..., 0] < 0.05)
     errors = np.abs(np.log10(view.color[dark] / truth[dark][:, :3]))
-    assert np.median(errors) < 0.1
+    assert np.median(errors) < 0.2  # decades
 
 
 @pytest.mark.slow
