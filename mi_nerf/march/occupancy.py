@@ -36,7 +36,7 @@ FAINTEST = 1e-4
 # The least density of a cell follows a smaller one at once. A larger one it follows from the
 # threshold on, by this factor a step: rays that pass a surface within a cell by will hardly
 # find so many before them that all met the surface, though cells add up along them.
-_FLOOR_GROWTH = 1.2
+_FLOOR_GROWTH = 1.1
 
 
 class OccupancyGrid:

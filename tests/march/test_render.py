@@ -432,7 +432,7 @@ def test_the_floor_is_no_more_than_was_seen(ad: Any) -> None:
         floors.append(grid.floor())
     first = 0.01 / np.mean(grid.cell_size)
     np.testing.assert_allclose(floors[0], first, rtol=1e-5)
-    np.testing.assert_allclose(floors[1], 1.2 * first, rtol=1e-5)
+    np.testing.assert_allclose(floors[1], 1.1 * first, rtol=1e-5)
     assert not floors[2].any()
     np.testing.assert_allclose(floors[3], first, rtol=1e-5)
     refresh = {"queries": 16, "threshold": 0.0, "decay": 0.9}
@@ -464,10 +464,10 @@ def test_what_is_seen_past_a_surface_is_not_hidden(ad: Any, share: float) -> Non
 
 
 def slow_floor(floor: np.ndarray, cells: np.ndarray, density: np.ndarray, first: float) -> Any:
-    """Cell by cell: raised by a fifth, from the first number on, to no more than the least."""
+    """Cell by cell: raised by a tenth, from the first number on, to no more than the least."""
     result = floor.astype(float)
     for cell in set(cells):
-        risen = max(1.2 * result[cell], first)
+        risen = max(1.1 * result[cell], first)
         result[cell] = min(risen, density[cells == cell].min())
     return result
 

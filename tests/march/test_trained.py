@@ -73,7 +73,7 @@ def test_it_knows_what_is_dense_everywhere(ad: Any) -> None:
     for _ in range(10):
         train()
     assert not grid.floor().any()  # not from the start
-    for _ in range(_START + 60):
+    for _ in range(_START + 100):
         train()
     floor = grid.floor()
     assert floor[..., :2].min() > 15 and floor[..., :2].max() <= 20
