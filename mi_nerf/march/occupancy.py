@@ -5,7 +5,8 @@ marked empty while its optical thickness, as last seen, stays below a threshold:
 that crosses n such cells loses an opacity of about n · threshold at most.
 
 During training the grid also knows a density that each cell has everywhere, as far as
-seen: samples behind much of that are hidden and need no evaluation either.
+training's own samples have seen: samples behind much of that are hidden and need no
+evaluation either.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from typing import Any
 import drjit as dr
 import numpy as np
 
-from ..base.arrays import upload, vector3_type
+from ..base.arrays import Floats, upload, vector3_type
 from ..base.box import Corner
 from ..fields.protocol import Field
 from .bit_field import BitField
+from .samples import Samples
+from .strata import points_along
 
 # Value of a cell that was never looked at: occupied whatever the threshold.
 _UNSEEN = np.float32(np.finfo(np.float32).max)
@@ -30,8 +33,10 @@ THRESHOLD = 0.01
 # Share of the threshold below which a cell is empty even if the whole scene is that thin.
 FAINTEST = 1e-4
 
-# The least density of a cell follows a smaller one at once, a larger one by this share a look.
-_FLOOR_RISE = 0.3
+# The least density of a cell follows a smaller one at once. A larger one it follows from the
+# threshold on, by this factor a step: rays that pass a surface within a cell by will hardly
+# find so many before them that all met the surface, though cells add up along them.
+_FLOOR_GROWTH = 1.1
 
 
 class OccupancyGrid:
@@ -54,7 +59,9 @@ class OccupancyGrid:
         self._float, self._uint = float_type, dr.uint32_array_t(float_type)
         self._candidates = upload(self._uint, np.flatnonzero(cells).astype(np.uint32))
         self._values = upload(float_type, np.where(cells.ravel(), _UNSEEN, 0))
-        self._floor = dr.zeros(float_type, cells.size)
+        # Bits of numbers: of those that are not negative, in the same order, and every device
+        # has extremes of integers.
+        self._floor = dr.zeros(self._uint, cells.size)
         self._hull = self._mask = self._upload_mask(cells)
 
     @classmethod
@@ -103,7 +110,7 @@ class OccupancyGrid:
 
     def floor(self) -> np.ndarray[Any, Any]:
         """(X, Y, Z) densities below which the cells have seldom been seen, 1/scene unit."""
-        return np.array(self._floor).reshape(self.shape)
+        return np.array(self._floor).view(np.float32).reshape(self.shape)
 
     def fraction(self) -> float:
         """Share of the cells that are sampled."""
@@ -136,7 +143,28 @@ class OccupancyGrid:
 
     def least_density(self, cell: Any) -> Any:
         """What light meets everywhere in these cells, as far as seen; 1/scene unit."""
-        return dr.gather(self._float, self._floor, cell)
+        return dr.reinterpret_array(self._float, dr.gather(self._uint, self._floor, cell))
+
+    def witness(self, samples: Samples, density: Floats) -> None:
+        """Takes note of the densities of the samples that training has asked for.
+
+        They are what raises the least density of a cell, as they lie where rays pass: looks at
+        random places cannot tell whether a surface runs through the cell. What is seen past it
+        would be hidden, training would fill the cell in place of that, and images get worse.
+
+        Args:
+            density: R·S numbers, of all samples.
+        """
+        with dr.suspend_grad():
+            index = samples.index
+            t, density = (dr.gather(self._float, v, index) for v in (samples.t, density))
+            cell = self.cell(points_along(samples.o, samples.d, t, index // samples.count))
+            density = dr.select(density >= 0, density, 0)  # what is not a number hides nothing
+            first = dr.opaque(self._float, THRESHOLD / float(np.mean(self.cell_size)))
+            risen = dr.fmin(dr.fmax(_FLOOR_GROWTH * self.least_density(cell), first), density)
+            dr.eval(cell, density, risen)
+            self._extreme(dr.ReduceOp.Max, risen, cell)
+            self._extreme(dr.ReduceOp.Min, density, cell)
 
     def refresh(
         self, field: Field, rng: Any, turn: int, *, queries: int, threshold: float, decay: float
@@ -190,7 +218,7 @@ class OccupancyGrid:
             if array.shape != self.shape:
                 raise ValueError(f"occupancy grid is {array.shape}, expected {self.shape}")
         self._values = upload(self._float, np.asarray(values, np.float32).ravel())
-        self._floor = upload(self._float, np.asarray(floor, np.float32).ravel())
+        self._floor = upload(self._uint, np.asarray(floor, np.float32).ravel().view(np.uint32))
         self._mask = self._upload_mask(mask)
 
     def _upload_mask(self, cells: np.ndarray[Any, Any]) -> Any:
@@ -212,11 +240,17 @@ class OccupancyGrid:
             density = field.density(p)
             old = dr.gather(self._float, self._values, cell)
             old = dr.select(old < float(_UNSEEN), old * decay, 0)
-            floor = dr.gather(self._float, self._floor, cell)
-            risen = floor + _FLOOR_RISE * (density - floor)
+            dr.eval(old, density, cell, new)
             dr.scatter(self._values, dr.fmax(old, density), cell, new)
-            dr.scatter(self._floor, dr.fmin(risen, density), cell, new)
-            dr.eval(self._values, self._floor)
+            dr.eval(self._values)
+            self._extreme(dr.ReduceOp.Min, dr.select(density >= 0, density, 0), cell, new)
+
+    def _extreme(self, operation: Any, density: Floats, cell: Any, active: Any = True) -> None:
+        """Raises or lowers least densities of cells, several of which may be the same."""
+        bits = dr.reinterpret_array(self._uint, density)
+        mode = dr.ReduceMode.Direct  # copies of the grid, one a thread, would cost more
+        dr.scatter_reduce(operation, self._floor, bits, cell, active, mode=mode)
+        dr.eval(self._floor)
 
     def _points(self, cell: Any, rng: Any) -> Any:
         """A random point in each of these cells."""

@@ -6,8 +6,10 @@ from typing import Any
 
 import drjit as dr
 
+from ..base.arrays import Floats
 from ..fields.protocol import Field
 from .occupancy import THRESHOLD, OccupancyGrid
+from .samples import Samples
 
 # As the presets have it (mi_nerf.training.config): a refresh every so many changes of the
 # weights, from that change on, of so many cells for each along the box; what densities fade by.
@@ -39,3 +41,8 @@ class TrainedGrid(OccupancyGrid):
             threshold=THRESHOLD,
             decay=_DECAY,
         )
+
+    def witness(self, samples: Samples, density: Floats) -> None:
+        """See :meth:`OccupancyGrid.witness`; what is seen before the first look says nothing."""
+        if self._changes >= _START:
+            super().witness(samples, density)

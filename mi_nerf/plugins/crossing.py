@@ -74,6 +74,9 @@ class Crossing:
                 fuse=not exact,
                 emission=emission,
             )
+        occupancy = whole.occupancy
+        if marched.trained and mode == dr.ADMode.Backward and occupancy is not None:
+            occupancy.witness(self.samples, self.evaluation.density)
 
     def prepare(self, mode: dr.ADMode) -> None:
         """Makes the field's answers the leaves of what is computed next."""

@@ -413,6 +413,10 @@ class Trainer:
         with stage("network"):
             for evaluation, _ in passes:
                 evaluation.backward()
+        formed = self.step_count >= self.config.occupancy.start
+        if self.occupancy is not None and march.hidden > 0 and formed:
+            with stage("occupancy"):
+                self.occupancy.witness(samples, evaluation.density)
         return _Part(loss, mse, complete, queries, wanted)
 
     def _evaluate(self, field: NeuralField, samples: Samples) -> Evaluation:

@@ -8,8 +8,14 @@ import drjit as dr
 import numpy as np
 
 from mi_nerf.fields.closed_form import closed_form
+from mi_nerf.march.marched import MarchedField
 from mi_nerf.march.occupancy import OccupancyGrid
+from mi_nerf.march.placing import place_samples
+from mi_nerf.march.samples import Samples
+from mi_nerf.march.settings import MarchSettings
+from mi_nerf.march.strata import points_along
 from mi_nerf.march.trained import _EVERY, _START, TrainedGrid
+from tests.support.arrays import vectors
 
 
 def slab(ad: Any) -> Any:
@@ -55,8 +61,26 @@ def test_it_looks_seldom_and_not_from_the_start(ad: Any) -> None:
 def test_it_knows_what_is_dense_everywhere(ad: Any) -> None:
     """Below the step, the least density of a cell rises to what it is; beyond, it stays 0."""
     grid, field = trained(ad, np.ones((4, 4, 4), bool)), slab(ad)
-    for _ in range(_START + 100 * _EVERY):
+    rays = np.random.default_rng(0).uniform(-1, 1, (2000, 3))
+    rays[:, 2] = 1  # from above
+    o, d = vectors(ad, rays), vectors(ad, np.tile([0.0, 0, -1], (2000, 1)))
+
+    def train() -> None:
+        samples = place_samples(MarchedField(field, MarchSettings(samples=16), grid), o, d)
         grid.follow(field)
+        grid.witness(samples, field.density(points(ad, samples)))
+
+    for _ in range(10):
+        train()
+    assert not grid.floor().any()  # not from the start
+    for _ in range(_START + 100):
+        train()
     floor = grid.floor()
     assert floor[..., :2].min() > 15 and floor[..., :2].max() <= 20
     assert floor[..., 2:].max() == 0
+
+
+def points(ad: Any, samples: Samples) -> Any:
+    """Where all samples are."""
+    ray = dr.arange(ad.UInt32, len(samples.t)) // samples.count
+    return points_along(samples.o, samples.d, samples.t, ray)
