@@ -9,7 +9,7 @@ import mitsuba as mi
 import pytest
 
 from mi_nerf.base.errors import InputError
-from mi_nerf.generation.plan import protocol_name
+from mi_nerf.generation.planning import protocol_name
 from mi_nerf.generation.protocol import Options
 from mi_nerf.scene_xml.scene_file import SceneFile
 
