@@ -116,7 +116,7 @@ class NerfPathIntegrator(MarchingIntegrator):
     is detached. As in :monosp:`prb`, edges of surfaces that move are left out; here surfaces,
     sensors and the positions of lights have no derivatives at all, and asking for one is an
     error. Left out, too: a channel of colour that is exactly 0, as to what is reflected more
-    than once; and the alpha channel, as to fields
+    than once; mirrors or glass within :monosp:`blendbsdf`; and the alpha channel, as to fields
     behind surfaces that let light straight through. Russian roulette and ``stop`` apply to
     derivatives as they do to pictures.
 

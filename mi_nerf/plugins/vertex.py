@@ -9,19 +9,17 @@ every direction, derivatives stay without bias.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 from mitsuba.python.ad.integrators.common import mis_weight
 
-from .colors import Spectrum, unpolarized
+from .colors import unpolarized
 from .field_light import FieldLight
 from .light_choice import Chosen, choose
 from .path_state import Chance, Connections, Ends, Paths, PathSettings
 
-_SAME_WAY = 1e-5  # of the cosine between directions, by rounding
 _MOST_SURVIVE = 0.95  # of a wavefront in Russian roulette, as in Mitsuba's path tracer
 
 
@@ -182,33 +180,9 @@ class Surroundings:
         with dr.resume_grad():
             value = bsdf.eval(context, si, si.to_local(following.d), going & ~following.delta)
             value = unpolarized(value)
-            value = dr.select(
-                specular, self._mirrored(si, bsdf, following, chance, specular), value
-            )
+            sample, weight = bsdf.sample(context, si, chance.bsdf_component, chance.bsdf, specular)
+            value = dr.select(specular, unpolarized(weight) * sample.pdf, value)
             through = unpolarized(bsdf.eval_null_transmission(si, straight))
             value = dr.select(straight, through, value)
             known = dr.detach(value) > 0
             return dr.select(known, value / dr.select(known, dr.detach(value), 1), 1)
-
-    def _mirrored(self, si: Any, bsdf: Any, following: Paths, chance: Chance, specular: Any) -> Any:
-        """The weight of a sample without density, times the probability of its choice."""
-        context, value = mi.BSDFContext(), Spectrum(0)
-        if not self.blended:
-            sample, weight = bsdf.sample(context, si, chance.bsdf_component, chance.bsdf, specular)
-            return unpolarized(weight) * sample.pdf
-        # By what a blend weighs its parts, it says only when asked for one of them: the value is
-        # the sum over those that send light the same way.
-        for context.component in range(self.blended):
-            sample, weight = bsdf.sample(context, si, chance.bsdf_component, chance.bsdf, specular)
-            alike = dr.dot(si.to_world(sample.wo), following.d) > 1 - _SAME_WAY
-            alike &= mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
-            value += dr.select(dr.detach(alike), unpolarized(weight) * sample.pdf, 0)
-        return value
-
-    @cached_property
-    def blended(self) -> int:
-        """The most components of the scene's BSDFs if there are blends among them, else 0."""
-        parts = mi.traverse(self.scene).hierarchy
-        if not any(part.class_name() == "BlendBSDF" for part in parts):
-            return 0
-        return max(part.component_count() for part in parts if isinstance(part, mi.BSDF))

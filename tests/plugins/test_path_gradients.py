@@ -292,26 +292,6 @@ def test_light_of_a_box_agrees_with_the_derivative_of_its_closed_form(sampled: b
     assert seen[keys[1]] == pytest.approx(radiance, rel=3e-2)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("mirrored", ["conductor", "dielectric"])
-def test_how_much_of_a_blend_is_a_mirror(mirrored: str) -> None:
-    """Pictures are linear in the weight of a blend: the derivative is that between its ends."""
-    matt = {"type": "diffuse", "reflectance": rgb((0.1, 0.1, 0.1))}
-    blend = {"type": "blendbsdf", "weight": 0.4, "first": matt, "second": {"type": mirrored}}
-    sky = {"type": "constant", "radiance": rgb((1.3, 1.2, 1.1))}
-    field = slab(place().translate([0, 0.5, 0.2]).scale(0.5), 2.0, GLOW)
-    objects = {"floor": {**floor(), "bsdf": blend}, "sky": sky, "field": field}
-    objects["light"] = point_light((0.2, 0.1, 2.5))
-    key = "floor.bsdf.weight.value"
-    slopes = Slopes(scene_of(paths(max_depth=2), **objects), {key: plus}, pull_of())
-    found = np.array([slopes.backward(seed, 64)[key] for seed in range(1, 5)])
-    ends = [[slopes.value(key, x, seed, 64) for seed in range(11, 15)] for x in (0.6, -0.4)]
-    expected = np.subtract(*ends)
-    error = np.hypot(found.std(ddof=1), expected.std(ddof=1)) / 2
-    assert abs(found.mean() - expected.mean()) < 4 * error
-    assert error < 0.02 * abs(expected.mean())
-
-
 # ---- Replay ---------------------------------------------------------------------
 
 
