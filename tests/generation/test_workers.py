@@ -160,6 +160,24 @@ def test_executors_of_the_caller(whole: tuple[Path, dict[str, bytes]], tmp_path:
 
 
 @pytest.mark.slow
+def test_several_views_are_one_job_where_jobs_start_slowly(
+    whole: tuple[Path, dict[str, bytes]], tmp_path: Path
+) -> None:
+    class Queue(ThreadPoolExecutor):
+        slow_start, width = True, 1
+        jobs = 0
+
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Any:
+            self.jobs += 1
+            return super().submit(fn, *args, **kwargs)
+
+    scene, files = whole
+    with Queue(1) as queue:
+        make(scene, tmp_path / "data", few(), executor=queue)
+    assert queue.jobs == 3 and contents(tmp_path / "data") == files
+
+
+@pytest.mark.slow
 def test_a_scene_that_was_changed_is_loaded_again(tmp_path: Path) -> None:
     with ThreadPoolExecutor(1) as threads:
         for radius in ("0.5", "0.3"):
