@@ -163,9 +163,7 @@ def test_too_many(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_integrators_without_single_rays(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_integrators_without_single_rays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sample by sample, if nothing else is known of an integrator: as many bad ones."""
     scene = square(tmp_path / "s", texture_of(1 / 300, np.nan))
     ray_by_ray = make(scene, tmp_path / "a")
