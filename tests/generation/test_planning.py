@@ -143,6 +143,14 @@ def test_the_suite_keeps_its_cameras() -> None:
         assert (found == np.concatenate(expected)).all()
 
 
+def test_light_passes_what_lets_it_through(tmp_path: Path) -> None:
+    """A box of nothing around the object is no wall, and what is in it no room."""
+    null = '<shape type="cube" id="null"><bsdf type="null"/></shape>'
+    plan = plan_of(write_scene(tmp_path, BALL, SKY, null))
+    assert plan.cameras == "hemisphere" and plan.survey.lit > 0.9
+    assert plan_of(write_scene(tmp_path, BALL, SKY)).survey.lit > 0.9
+
+
 # ---- Up ----------------------------------------------------------------------
 
 
