@@ -31,6 +31,7 @@ from .survey import Survey, look, percent, sees
 Array = np.ndarray[Any, Any]
 
 _DARKNESS, _SEEING, _LIT, _HIDDEN, _ENCLOSED = 0.5, 0.25, 0.005, 0.9, 0.8
+_NOTHING = 5e-3  # share of the pixels that sees the object by chance, past edges of walls
 _WORTH_A_WORD = 0.02  # darkness that is mentioned
 
 
@@ -121,7 +122,7 @@ def _around(name: str, here: Situation, size: tuple[int, int], counts: dict[str,
             return _inside(here, f"{reason}: this is a room, cameras are inside")
         except InputError:
             reason += ", but there is no room either"
-    if found.survey.coverage == 0:
+    if found.survey.coverage < _NOTHING:
         raise InputError(
             f"protocol '{name}': {reason}, and none sees the object, expected {{}}",
             Option("protocol", "room"),

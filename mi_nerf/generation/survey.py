@@ -109,8 +109,12 @@ def _lit(scene: Any, points: Array) -> float:
     random = np.random.default_rng(0).random((2, len(points)), np.float32)
     at = dr.zeros(mi.Interaction3f, len(points))
     at.p = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
-    _, light = scene.sample_emitter_direction(at, mi.Point2f(random), True)
-    return float(np.mean(np.array(dr.max(light)).reshape(-1, _LIGHTS).max(axis=1) > 0))
+    # What lets light straight through does not count: Mitsuba's own test would take it for solid.
+    way, light = scene.sample_emitter_direction(at, mi.Point2f(random), False)
+    distance, shines = np.array(way.dist), np.array(dr.max(light) > 0)
+    hits = first_hits(scene, points, np.array(way.d).T, hide_emitters=True)
+    arrives = shines & (hits.distance >= distance * (1 - 1e-3))
+    return float(arrives.reshape(-1, _LIGHTS).any(axis=1).mean())
 
 
 def percent(share: float) -> str:
