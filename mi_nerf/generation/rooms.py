@@ -28,6 +28,7 @@ _DIRECTIONS = 64  # in which a place is looked at
 _PLACES = 2048  # that are looked at to know the room
 _ENCLOSED = 0.6  # share of directions that meet something, inside a room
 _DARK = 0.03  # of which those that meet the back of a wall are at most so many
+_SPACIOUS = 0.03  # share of the scene that is inside: less are gaps between things
 _CLEAR = 0.15  # distance from all surfaces, per typical distance of the walls
 _FEWEST = 64  # places, below which cameras may stand nearer to surfaces
 _SMALL = 1 / 4  # of the volume searched, below which it is searched again, closer around the room
@@ -147,7 +148,7 @@ def _room_in(scene: Any, box: Bounds, start: Array | None, seed: int) -> _Known:
     if start is not None:
         points = np.concatenate([np.asarray(start)[None], points])
     inside = points[_inside(scene, points, 0.0)]
-    if not len(inside):
+    if len(inside) < (1 if enclosed else _SPACIOUS * _PLACES):
         raise InputError("protocol 'room': no place in the scene is enclosed, expected a room")
     distances = _distances(scene, inside)
     typical = np.median(distances, axis=1)
