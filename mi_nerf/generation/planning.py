@@ -43,7 +43,7 @@ def make_plan(
         InputError: for options that make no sense, alone or for this scene.
     """
     protocol_name(file, options)  # is known
-    spp = _samples(file, scene, options)
+    spp, about_samples = _samples(file, scene, options)
     sensors = read_sensors(scene) if file.plugins("Sensor") else []
     parts = with_kept(read_parts(file), scene, hidden)
     box = _together(box, box_of(parts))
@@ -71,6 +71,7 @@ def make_plan(
         survey=choice.survey,
         keep_emitters=options.keep_emitters,
         notes=(
+            *about_samples,
             f"up is taken from {why}",
             *filter(None, [str(choice.subject)]),
             *choice.notes,
@@ -158,25 +159,25 @@ def _about(what: str, having: Sequence[SensorCamera], taken: bool, how: str) -> 
 # ---- Numbers -----------------------------------------------------------------
 
 
-def _samples(file: SceneFile, scene: Any, options: Options) -> int:
-    """Samples a pixel."""
-    spp = options.spp
-    if spp is None:
-        sensor = scene.sensors()[0] if file.plugins("Sensor") else None
-        spp = _sampler_spp(sensor) if file.plugins("Sampler") else _DEFAULT_SPP
-    if spp < 2:
+def _samples(file: SceneFile, scene: Any, options: Options) -> tuple[int, list[str]]:
+    """Samples a pixel, and a note where they are not those that were wanted."""
+    has_sampler = bool(file.plugins("Sampler")) and bool(file.plugins("Sensor"))
+    sampler = scene.sensors()[0].sampler() if has_sampler else None
+    wanted = options.spp
+    if wanted is None:
+        wanted = _DEFAULT_SPP if sampler is None else int(sampler.sample_count())
+    if wanted < 2:
         raise InputError(
-            "{}: expected at least 2, of which the noise is estimated", Option("spp", spp)
+            "{}: expected at least 2, of which the noise is estimated", Option("spp", wanted)
         )
-    return spp
+    if sampler is None or (spp := _taken(sampler, wanted)) == wanted:
+        return wanted, []
+    kind = sampler.class_name()
+    return spp, [f"{spp} samples a pixel: the scene's sampler {kind} cannot take half of {wanted}"]
 
 
-def _sampler_spp(sensor: Any) -> int:
-    """The samples of a sensor's sampler, or some more where it cannot take half of them."""
-    if sensor is None:
-        return _DEFAULT_SPP
-    sampler = sensor.sampler()
-    spp = int(sampler.sample_count())
+def _taken(sampler: Any, spp: int) -> int:
+    """So many samples, or some more where a sampler cannot take half of them."""
     for half in halves(spp):
         sampler.set_sample_count(half)
         if half > 0 and sampler.sample_count() != half:

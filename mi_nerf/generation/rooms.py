@@ -148,7 +148,7 @@ def _room_in(scene: Any, box: Bounds, start: Array | None, seed: int) -> _Known:
     if start is not None:
         points = np.concatenate([np.asarray(start)[None], points])
     inside = points[_inside(scene, points, 0.0)]
-    if len(inside) < (1 if enclosed else _SPACIOUS * _PLACES):
+    if len(inside) < (1 if start is not None else _SPACIOUS * _PLACES):
         raise InputError("protocol 'room': no place in the scene is enclosed, expected a room")
     distances = _distances(scene, inside)
     typical = np.median(distances, axis=1)

@@ -194,7 +194,6 @@ def prepare(file: SceneFile, options: Options) -> tuple[Tracer, Plan]:
         integrator.hide_emitters = hidden.any and not hidden.partly
     has_sampler = bool(file.plugins("Sampler")) and bool(file.plugins("Sensor"))
     sampler = scene.sensors()[0].sampler() if has_sampler else mi.load_dict({"type": "independent"})
-    _check_sampler(sampler, plan)
     return Tracer(scene, integrator, sampler, plan, hidden), plan
 
 
@@ -253,20 +252,6 @@ def _load(file: SceneFile, options: Options, hide: bool) -> _Loaded:
             )
         raise InputError(f"{file.path}: its box is empty, expected shapes that can be seen")
     return _Loaded(file, scene, hidden, box, notes)
-
-
-def _check_sampler(sampler: Any, plan: Plan) -> None:
-    """Refuses numbers of samples that the sampler would quietly change."""
-    for count in plan.halves:
-        sampler.set_sample_count(count)
-        if sampler.sample_count() != count:
-            raise InputError(
-                "{}: the scene's sampler '{}' cannot take half of them, {}, expected e.g. {}",
-                Option("spp", plan.spp),
-                sampler.class_name(),
-                count,
-                2 * sampler.sample_count(),
-            )
 
 
 def _describe(file: SceneFile, plan: Plan, variant: str) -> dict[str, Any]:

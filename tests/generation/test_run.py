@@ -655,12 +655,15 @@ def test_nothing_to_see(refused: Callable[..., str], tmp_path: Path) -> None:
     assert "all its shapes are light sources" in line and "expected --keep-emitters all" in line
 
 
-def test_samplers_that_would_take_another_number(
-    refused: Callable[..., str], tmp_path: Path
+def test_samplers_that_take_another_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """Two halves of at least as many samples as wanted, which is said."""
     scene = ball(tmp_path, SENSOR_Y_UP)
-    line = refused("generate", scene, tmp_path / "out", "--spp", "30", "--size", "8", "8")
-    assert "cannot take half of them, 15, expected e.g. 32" in line
+    record = make(scene, tmp_path / "out", small(spp=30))
+    assert record["settings"]["spp"] == 32
+    generate(scene, tmp_path / "told", VARIANT, small(spp=30))
+    assert "32 samples a pixel" in capsys.readouterr().out
 
 
 def test_folders_in_use(refused: Callable[..., str], tmp_path: Path) -> None:

@@ -38,8 +38,8 @@ def test_every_point_counts_alike_on_average(weights: list[float]) -> None:
     """Each as 1/M, whatever the light that is expected: the estimate has no bias."""
     which, counts = chosen(weights)
     mean = np.bincount(which, counts, minlength=len(weights)) / len(which)
-    # The rarest point has about 20000 · 0.05 / 9 of the choices.
-    np.testing.assert_allclose(mean, 1 / len(weights), rtol=2e-2)
+    # The rarest point has about 20000 · 0.05 / 9 of the choices, give or take a few.
+    np.testing.assert_allclose(mean, 1 / len(weights), rtol=5e-2)
 
 
 @given(st.lists(st.one_of(st.just(0.0), st.floats(1e-3, 1e3)), min_size=2, max_size=9))
