@@ -122,7 +122,7 @@ def _around(name: str, here: Situation, size: tuple[int, int], counts: dict[str,
             return _inside(here, f"{reason}: this is a room, cameras are inside")
         except InputError:
             reason += ", but there is no room either"
-    if found.survey.coverage < _NOTHING:
+    if found.survey.coverage < _NOTHING and here.options.center is None:
         raise InputError(
             f"protocol '{name}': {reason}, and none sees the object, expected {{}}",
             Option("protocol", "room"),
