@@ -85,8 +85,20 @@ def with_kept(parts: Sequence[Part], scene: Any, hidden: Hidden | None) -> list[
     """The parts, of which light sources that are seen are like others."""
     if hidden is None or not hidden.chosen:
         return list(parts)
-    kept = {s.id() for s in scene.shapes() if s.is_emitter() and hidden.keeps(s)}
-    return [replace(part, glows=part.glows and part.name not in kept) for part in parts]
+    kept = [s for s in scene.shapes() if s.is_emitter() and hidden.keeps(s)]
+    names = {shape.id() for shape in kept}
+    boxes = {_corners(shape.bbox().min, shape.bbox().max) for shape in kept}  # many have no name
+    return [
+        replace(part, glows=False)
+        if part.name in names or _corners(part.lower, part.upper) in boxes
+        else part
+        for part in parts
+    ]
+
+
+def _corners(lower: Any, upper: Any) -> bytes:
+    """A box as it can be looked up."""
+    return np.float32(np.concatenate([np.ravel(lower), np.ravel(upper)])).tobytes()
 
 
 def _together(a: Bounds, b: Bounds | None) -> Bounds:
