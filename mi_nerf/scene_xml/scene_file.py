@@ -13,6 +13,7 @@ import numpy as np
 
 from ..base.errors import InputError
 from .instancing import copy_instances
+from .merging import merge_meshes
 from .provenance import digest, files_of
 from .refusals import check_file, refusal
 from .spectra import spectra_as_values
@@ -108,7 +109,7 @@ class SceneFile:
 
         Args:
             merge: Meshes of one material become one, which renders faster, unless Mitsuba finds
-                that they do not go together, as those whose normals are flipped and others.
+                that they do not go together. The order of shapes is always the same.
 
         Raises:
             InputError: with what Mitsuba says, if it refuses.
@@ -130,7 +131,7 @@ class SceneFile:
         copy_instances(state)
         mi.parser.transform_merge_equivalent(self._config, state)
         if merge:
-            mi.parser.transform_merge_meshes(self._config, state)
+            merge_meshes(state)
         scene = mi.parser.instantiate(self._config, state)
         return scene[0] if isinstance(scene, list) else scene
 
