@@ -17,6 +17,7 @@ from ..base.arrays import Mask
 from ..base.errors import InputError, Option
 
 ALL = "all"
+_MENTIONED = 4  # names in a line
 
 
 class Hidden:
@@ -50,6 +51,19 @@ class Hidden:
         """Whether something else is seen."""
         self._every_shape, self._some_shape = all(shapes), any(shapes)
         self._table: Any = None
+
+    @property
+    def note(self) -> str:
+        """Which shapes are not seen because they shine, for people; nothing without any."""
+        pairs = zip(self._scene.emitters(), self._hidden, strict=True)
+        unseen = [e for e, is_hidden in pairs if is_hidden and e.get_shape() is not None]
+        if not unseen:
+            return ""
+        named = list(dict.fromkeys(filter(None, map(_best_name, unseen))))[:_MENTIONED]
+        more = len(unseen) - len(named)
+        others = f"{more} {'more' if named else 'without a name'}" if more else ""
+        which = " and ".join(filter(None, [", ".join(named), others]))
+        return f"lights that are not seen: {which} (--keep-emitters ID… or all shows them)"
 
     def keeps(self, shape: Any) -> bool:
         """Whether a shape that shines was chosen to be seen, as part of the object."""
@@ -87,14 +101,16 @@ def _check(kept: set[str], emitters: list[Any]) -> None:
     """Refuses IDs of what is no light source, or none that can be seen."""
     seen = [e for e in emitters if e.get_shape() is not None or e.is_environment()]
     known = set().union(*(_names(e) for e in seen)) | {ALL}
-    names = ", ".join(map(_best_name, seen))
+    names = ", ".join(dict.fromkeys(filter(None, map(_best_name, seen))))
     for name in sorted(kept - known):
         known_otherwise = any(name in _names(e) for e in emitters)
         raise InputError(
             "{}: {}, expected {}",
             Option("keep_emitters", name),
             "cannot be seen, it is no surface" if known_otherwise else "no light source",
-            f"{ALL} or {names}" if seen else "none, no light source can be seen",
+            (f"{ALL} or {names}" if names else ALL)
+            if seen
+            else "none, no light source can be seen",
         )
 
 
@@ -106,4 +122,4 @@ def _names(emitter: Any) -> set[str]:
 def _best_name(emitter: Any) -> str:
     """The name that people know a light source by: that of its shape."""
     shape = emitter.get_shape()
-    return str(emitter.id() if shape is None else shape.id())
+    return str(emitter.id() if shape is None else shape.id() or emitter.id())

@@ -51,7 +51,7 @@ def make_plan(
         up, why = vertical(sensors, named_ups(file), parts)
     else:
         up, why = told_up(options.up), "what was told"
-    subject = _subject(parts, box, sensors, options)
+    subject = _subject(parts, box, sensors, options, hidden is None or hidden.any)
     choice = choose(Situation(file, scene, box, up, sensors, subject, options, hidden or True))
     return Plan(
         protocol=choice.protocol,
@@ -85,8 +85,20 @@ def with_kept(parts: Sequence[Part], scene: Any, hidden: Hidden | None) -> list[
     """The parts, of which light sources that are seen are like others."""
     if hidden is None or not hidden.chosen:
         return list(parts)
-    kept = {s.id() for s in scene.shapes() if s.is_emitter() and hidden.keeps(s)}
-    return [replace(part, glows=part.glows and part.name not in kept) for part in parts]
+    kept = [s for s in scene.shapes() if s.is_emitter() and hidden.keeps(s)]
+    names = {shape.id() for shape in kept}
+    boxes = {_corners(shape.bbox().min, shape.bbox().max) for shape in kept}  # many have no name
+    return [
+        replace(part, glows=False)
+        if part.name in names or _corners(part.lower, part.upper) in boxes
+        else part
+        for part in parts
+    ]
+
+
+def _corners(lower: Any, upper: Any) -> bytes:
+    """A box as it can be looked up."""
+    return np.float32(np.concatenate([np.ravel(lower), np.ravel(upper)])).tobytes()
 
 
 def _together(a: Bounds, b: Bounds | None) -> Bounds:
@@ -97,11 +109,26 @@ def _together(a: Bounds, b: Bounds | None) -> Bounds:
 
 
 def _subject(
-    parts: Sequence[Part], box: Bounds, sensors: Sequence[SensorCamera], options: Options
+    parts: Sequence[Part],
+    box: Bounds,
+    sensors: Sequence[SensorCamera],
+    options: Options,
+    hides: bool,
 ) -> Subject:
-    """What the cameras look at."""
+    """What the cameras look at.
+
+    Args:
+        hides: Whether parts that glow are not seen.
+    """
     if options.object is not None:
-        return told_subject(parts, options.object)
+        subject = told_subject(parts, options.object)
+        if hides and all(part.glows for part in parts if part.name in subject.names):
+            raise InputError(
+                "{}: a light source, which is not seen, expected {}",
+                Option("object", " ".join(options.object)),
+                Option("keep_emitters", " ".join(subject.names)),
+            )
+        return subject
     cameras = [sensor for sensor in sensors if sensor.kind is None]
     return find_subject(parts, box, cameras[0] if cameras else None)
 

@@ -223,7 +223,8 @@ def _plan(file: SceneFile, options: Options) -> tuple[_Loaded, Plan]:
         again = SceneFile(file.path, file.parameters)
         loaded = _load(again, replace(options, keep_emitters=()), plan.hide_emitters)
         plan = replace(plan, keep_emitters=())
-    return loaded, replace(plan, notes=(*first.notes, *plan.notes))
+    unseen = filter(None, [loaded.hidden.note])
+    return loaded, replace(plan, notes=(*first.notes, *unseen, *plan.notes))
 
 
 def _load(file: SceneFile, options: Options, hide: bool) -> _Loaded:

@@ -109,8 +109,12 @@ def _lit(scene: Any, points: Array) -> float:
     random = np.random.default_rng(0).random((2, len(points)), np.float32)
     at = dr.zeros(mi.Interaction3f, len(points))
     at.p = mi.Point3f(np.ascontiguousarray(points.T, np.float32))
+    if mi.is_spectral:  # no lamp shines at no wavelength
+        spread = mi.sample_shifted(mi.Float(np.random.default_rng(1).random(len(points))))
+        at.wavelengths, _ = mi.sample_rgb_spectrum(spread)
     # What lets light straight through does not count: Mitsuba's own test would take it for solid.
     way, light = scene.sample_emitter_direction(at, mi.Point2f(random), False)
+    light = mi.unpolarized_spectrum(light) if mi.is_polarized else light
     distance, shines = np.array(way.dist), np.array(dr.max(light) > 0)
     hits = first_hits(scene, points, np.array(way.d).T, hide_emitters=True)
     arrives = shines & (hits.distance >= distance * (1 - 1e-3))

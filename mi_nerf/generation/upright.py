@@ -73,7 +73,9 @@ def vertical(
     first = sensors[0]
     right, upward, back = (first.pose[:3, i] for i in range(3))
     for up in named:
-        if abs(up @ right) <= _SAME and up @ upward > _SAME:
+        # A mirrored camera may show the world upside down without being so.
+        agrees = abs(up @ upward) if first.mirrored else up @ upward
+        if abs(up @ right) <= _SAME and agrees > _SAME:
             if abs(up @ back) > _SAME or _is_axis(up):
                 return _snapped(up), f"the up vector of {first.name}"
     agreed = _agreed(sensors)

@@ -13,10 +13,13 @@ import numpy as np
 
 from ..base.errors import InputError
 from .instancing import copy_instances
+from .merging import merge_meshes
 from .provenance import digest, files_of
 from .refusals import check_file, refusal
 from .spectra import spectra_as_values
 from .substitutes import add_integrator, substitute
+
+_NO_MERGE = "Mesh::merge()"  # what Mitsuba names when it has begun to merge what it should not
 
 Bounds = tuple[tuple[float, float, float], tuple[float, float, float]]
 
@@ -105,20 +108,31 @@ class SceneFile:
         """Creates the scene.
 
         Args:
-            merge: Meshes of one material become one, which renders faster.
+            merge: Meshes of one material become one, which renders faster, unless Mitsuba finds
+                that they do not go together. The order of shapes is always the same.
 
         Raises:
             InputError: with what Mitsuba says, if it refuses.
         """
+        with self._one_line_errors(), self._search_path():
+            if not merge:
+                return self._instantiate(merge=False)
+            try:
+                return self._instantiate(merge=True)
+            except RuntimeError as error:
+                if _NO_MERGE not in str(error):
+                    raise
+            return self._instantiate(merge=False)
+
+    def _instantiate(self, *, merge: bool) -> Any:
         import mitsuba as mi
 
         state = mi.parser.ParserState(self._state)
-        with self._one_line_errors(), self._search_path():
-            copy_instances(state)
-            mi.parser.transform_merge_equivalent(self._config, state)
-            if merge:
-                mi.parser.transform_merge_meshes(self._config, state)
-            scene = mi.parser.instantiate(self._config, state)
+        copy_instances(state)
+        mi.parser.transform_merge_equivalent(self._config, state)
+        if merge:
+            merge_meshes(state)
+        scene = mi.parser.instantiate(self._config, state)
         return scene[0] if isinstance(scene, list) else scene
 
     def files(self) -> list[Path]:

@@ -99,3 +99,20 @@ def test_names_of_others(name: str, message: str) -> None:
         Hidden(scene(), True, [name])
     assert all(known in str(caught.value) for known in ("bulb", "tube", "sky"))
     assert "spark," not in str(caught.value)
+
+
+def test_lights_that_are_not_seen_are_named() -> None:
+    loaded = scene()
+    assert Hidden(loaded, False).note == "" and Hidden(loaded, True, ["all"]).note == ""
+    note = Hidden(loaded, True).note
+    assert "bulb" in note and "tube" in note and "--keep-emitters" in note
+    assert "sky" not in note and "spark" not in note
+    note = Hidden(loaded, True, ["bulb"]).note
+    assert "tube" in note and "bulb" not in note
+
+
+def test_many_lights_are_counted() -> None:
+    lamp = {"type": "sphere", "emitter": {"type": "area"}}
+    loaded = scene(**{f"lamp_{i}": {**lamp, "center": [i, 0, 9]} for i in range(7)})
+    shown = Hidden(loaded, True).note
+    assert shown.count(",") == 3 and "and 5 more" in shown

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mi_nerf.base.errors import InputError
-from mi_nerf.base.variants import choose_variant
+from mi_nerf.base.variants import available_variants, choose_variant, using_variant
 from mi_nerf.cameras.poses import is_rigid
 from mi_nerf.cli import main
 from mi_nerf.data import available_splits, load_dataset
@@ -88,6 +88,44 @@ def test_objects_told_by_id(tmp_path: Path) -> None:
         plan_of(path, object=("ball", "tabel"))
 
 
+def lamp(place: str, name: str = "") -> str:
+    """A cube of 0.4 that shines, with or without a name."""
+    told = f' id="{name}"' if name else ""
+    return (
+        f'<shape type="cube"{told}><transform name="to_world">'
+        f'<scale value="0.2"/><translate {place}/></transform><emitter type="area"/></shape>'
+    )
+
+
+def test_an_object_that_shines_must_be_seen(tmp_path: Path) -> None:
+    path = write_scene(tmp_path, BALL, SKY, lamp('x="3"', "bulb"))
+    with pytest.raises(InputError, match="object=.bulb.: a light source, which is not seen, exp"):
+        plan_of(path, object=("bulb",))
+    plan = plan_of(path, object=("bulb",), keep_emitters=("bulb",))
+    assert plan.center == pytest.approx((3, 0, 0)) and plan.survey.coverage > 0.1
+    assert plan_of(path, object=("bulb", "ball")).subject.names == ("bulb", "ball")
+
+
+def test_lights_without_a_name_that_are_kept_count(tmp_path: Path) -> None:
+    path = write_scene(tmp_path, BALL, SKY, lamp('x="3"'), lamp('x="-5"', "other"))
+    plan = plan_of(path)
+    assert plan.center == (0, 0, 0) and "lights that are not seen: other and 1 more" in said(plan)
+    plan = plan_of(path, keep_emitters=("all",))
+    assert plan.center == pytest.approx((-1, 0, 0.05)) and "not seen" not in said(plan)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("light", [SKY, lamp('x="3"', "bulb")])
+def test_light_is_found_at_its_wavelengths(tmp_path: Path, light: str) -> None:
+    spectral = [name for name in available_variants() if name.endswith("ad_spectral")]
+    if not spectral:
+        pytest.skip("no spectral variant on this machine")
+    path = write_scene(tmp_path, BALL, light)
+    with using_variant(spectral[0]):
+        plan = generation._plan(SceneFile(path), Options())[-1]
+    assert plan.survey.lit > 0.2 and "no light" not in said(plan)
+
+
 def test_ground_and_object_in_one_mesh(tmp_path: Path) -> None:
     write_mesh(tmp_path / "all.ply", *ground_and_pyramids())
     mesh = '<shape type="ply" id="all"><string name="filename" value="all.ply"/></shape>'
@@ -152,6 +190,13 @@ def test_light_passes_what_lets_it_through(tmp_path: Path) -> None:
 
 
 # ---- Up ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_up_of_mirrored_sensors_is_the_one_that_is_named(tmp_path: Path, axis: str) -> None:
+    sensor = pinhole(before=f'<scale {axis}="-1"/>')
+    plan = plan_of(write_scene(tmp_path, BALL, SKY, sensor), train=2, val=0, test=0)
+    assert plan.up == (0, 0, 1) and (places(plan)[:, 2] > 0).all()
 
 
 def test_up_and_what_it_comes_from(tmp_path: Path) -> None:

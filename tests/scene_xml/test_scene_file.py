@@ -107,3 +107,17 @@ def test_a_refusal_of_a_plugin_is_one_line(variant: str, tmp_path: Path) -> None
     with pytest.raises(InputError) as refused:
         file.load()
     assert str(refused.value).endswith('plugin of type "refusing": refusing: no Error: way')
+
+
+@pytest.mark.parametrize("flips", [("true", "false"), ("false", "true"), ("true", "true")])
+def test_meshes_that_do_not_merge(tmp_path: Path, flips: tuple[str, str]) -> None:
+    cubes = "".join(
+        f'<shape type="cube"><transform name="to_world"><translate x="{4 * i}"/></transform>'
+        f'<boolean name="flip_normals" value="{flip}"/><ref id="m"/></shape>'
+        for i, flip in enumerate(flips)
+    )
+    file = SceneFile(write(tmp_path / "s.xml", f'<bsdf type="diffuse" id="m"/>{cubes}'))
+    scene = file.load()
+    for i, flip in enumerate(flips):
+        si = scene.ray_intersect(mi.Ray3f([4 * i, 0, 9], [0, 0, -1]))
+        assert si.n.z[0] == (-1 if flip == "true" else 1)
