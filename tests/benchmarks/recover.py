@@ -118,7 +118,8 @@ def _room(camera: Any, fov: float, **objects: Any) -> dict[str, Any]:
 class Pose(Problem):
     """Three numbers of a place and one of a turn."""
 
-    iterations, rate = 120, 0.03
+    # With 4 samples a pixel, noise decides where the falling rate leaves it.
+    iterations, rate, spp = 120, 0.03, 16
     where, turn = (1.2, -0.75, 0.2), 20.0  # degrees
 
     def __init__(self, seed: int, folder: Path) -> None:
@@ -269,13 +270,14 @@ def _row(name: str, seeds: int) -> Row:
             problem = make(seed, Path(folder))
             errors = problem.solve()
             seconds.append(time.perf_counter() - start)
-        found += max(errors.values()) <= 1
+        found += bool(max(errors.values()) <= 1)  # of NumPy, JSON knows none
         said = ", ".join(f"{what}: {value:.2f} of it" for what, value in errors.items())
         print(f"{name}, seed {seed}: {said}; {seconds[-1]:.0f} s", flush=True)
     print(f"{name}: {found} of {seeds} seeds found it")
     return Row(
         {"what": name},
         {"found": Figure(found), "of": Figure(seeds), "time": median_of(seconds, "s")},
+        seeds=tuple(range(seeds)),
     )
 
 
