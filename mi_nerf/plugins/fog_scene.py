@@ -16,7 +16,7 @@ A field in a medium has a place at every depth t: with its weights w(t), in the 
 is V_{j−1} ∫ T(t) w(t) (c(t) − X(t)) dt, where the extinctions of both add up. Here T and X are
 those at one depth, the mean of t under w, of each ray. That is exact for fields that are opaque
 where they begin; else the error is of second order in how much the medium weakens light from the
-front of what is seen of the field to its back. Derivatives hold this depth as it is.
+front of what is seen of the field to its back. It has no derivatives.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..base.errors import InputError
 from ..march.intervals import ray_segments
 from .backdrop import Hit, Light, Surfaces
 from .colors import CHANNELS, Radiance, Spectrum
@@ -46,6 +47,7 @@ class InGap:
     active: Any  # where it matters what is behind them
     light: Light  # along the gap's ray
     passed: Passed | None  # by the media before that; None for the first gap
+    within: bool = False  # a medium
 
     @property
     def outputs(self) -> list[Any]:
@@ -162,10 +164,11 @@ class FogScene:
         )
         until = Fog(fog.medium, fog.start, at, active)
         passed = Passed([*before, until], camera.ray, active, random, self._uneven)
-        return InGap(gap, seen, active, light, passed)
+        return InGap(gap, seen, active, light, passed, within=True)
 
     def backward(self, traced: TracedInFog, gradients: list[Any]) -> None:
         """Carries the gradients of ``outputs`` to the parameters of the scene."""
+        _require_clear(traced)
         camera, gradients = traced.camera, list(gradients)
         for part in traced.parts:
             count = len(part.outputs)
@@ -184,6 +187,7 @@ class FogScene:
 
     def forward(self, traced: TracedInFog) -> list[Any]:
         """The derivatives of ``outputs`` along the gradients of the parameters."""
+        _require_clear(traced)
         camera, slopes = traced.camera, []
         for part in traced.parts:
             slopes += push_forward(self._fields, _rays(camera, part.gap))
@@ -214,6 +218,15 @@ class FogScene:
             both = ray_segments(marched.field, o, d, (fog.start * scale, fog.end * scale))
             found |= both.hit & (both.far - both.near > OVERLAP * (whole.far - whole.near))
         return fog.there & found
+
+
+def _require_clear(traced: TracedInFog) -> None:
+    """Refuses derivatives where fields are seen within media, at a depth that has none."""
+    if any(part.within for part in traced.parts):
+        raise InputError(
+            "nerf: what is seen of fields within fog has no derivatives, expected fog beside "
+            "their boxes"
+        )
 
 
 def _rays(camera: CameraRays, gap: Gap) -> Rays:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import mi_nerf  # noqa: F401
+from mi_nerf.base.errors import InputError
 from tests.support.composed import (
     GLOW,
     boxes_seen,
@@ -222,7 +223,7 @@ def test_a_field_in_fog_agrees_with_its_closed_form(
     integrator = nerf(nested, samples=512 if opaque else 64, paths=16, jitter=False)
     objects = {"box": slab(transform, density, color), "fog": bank_of_fog}
     scene, errors = mi.load_dict(scene_of(integrator, back=lamp(BACK), **objects)), []
-    for seed in range(8):
+    for seed in range(12):
         rays = camera_rays(scene, seed)
         box = (matrix_of(transform), density, np.array(color))
         expected = both_seen(*rays, box, fog, scale * EXTINCTION).reshape(12, 16, 3)
@@ -249,40 +250,16 @@ def test_fog_before_and_behind_an_opaque_field_scatters_as_around_a_black_cube()
     assert two.mean() > 0.1
 
 
-@pytest.mark.slow
-def test_derivatives_of_a_field_in_fog() -> None:
-    """By the field's density and colour, and by what the fog absorbs, against the closed form."""
+def test_derivatives_of_a_field_in_fog_are_refused() -> None:
     transform, density, color = box_of("here")
-    fog, scale = (-1.6, 1.4), 0.15
-    bank_of_fog = bank(fog[0], fog[1] - fog[0])
-    bank_of_fog["interior"]["scale"] *= scale
-    objects = {"box": slab(transform, density, color), "fog": bank_of_fog}
+    objects = {"box": slab(transform, density, color), "fog": bank(-1.6, 3.0)}
     scene = mi.load_dict(scene_of(nerf("volpath", jitter=False), back=lamp(BACK), **objects))
     params = mi.traverse(scene)
-    keys = [f"box.interior_medium.{key}" for key in ("density", "radiance")]
-    keys += ["fog.interior_medium.sigma_t.value.value"]
-    dr.enable_grad([params[key] for key in keys])
+    dr.enable_grad(params["box.interior_medium.density"])
     params.update()
-    found = []
-    for seed in range(12):
-        image = mi.render(scene, params, spp=16, seed=seed, seed_grad=1000 + seed)
-        dr.backward(dr.mean(image[..., :3], axis=None) * 3)
-        found.append(np.concatenate([np.array(dr.grad(params[key])).ravel() for key in keys]))
-        for key in keys:
-            dr.set_grad(params[key], 0)
-    o, d = camera_rays(scene)
-
-    def mean(change: np.ndarray) -> float:
-        box = (matrix_of(transform), density + change[0], np.array(color) + change[1:4])
-        extinction = scale * (EXTINCTION + 2 * change[4:])
-        return float(both_seen(o, d, box, fog, extinction).mean(axis=0).sum())
-
-    step = 1e-4 * np.eye(7)
-    expected = np.array([(mean(s) - mean(-s)) / 2e-4 for s in step])
-    error = np.std(found, axis=0, ddof=1) / np.sqrt(len(found))
-    off = np.mean(found, axis=0) - expected
-    assert (np.abs(off) < 5 * error + 1e-2 * np.abs(expected)).all()
-    assert (error < 0.1 * np.abs(expected)).all()
+    image = mi.render(scene, params, spp=1)
+    with pytest.raises((InputError, RuntimeError), match="within fog has no derivatives"):
+        dr.backward(dr.sum(image, axis=None))
 
 
 # ---- Other variants --------------------------------------------------------------

@@ -122,6 +122,10 @@ class Slopes:
         return errors
 
 
+# Choices that do not depend on what is changed: differences have common random numbers.
+FIXED = {"max_depth": 5, "rr_depth": 50, "emitter_candidates": 1, "sample_fields": False}
+
+
 def cabinet(**options: Any) -> dict[str, Any]:
     """Two fields among a matt floor, a mirror, glass, varnish, metal, and lights of all kinds."""
     tinted = {"type": "conductor", "specular_reflectance": rgb((0.9, 0.8, 0.7))}
@@ -133,7 +137,7 @@ def cabinet(**options: Any) -> dict[str, Any]:
     where = place().translate([0.1, 0.3, -0.1]).rotate([0.3, 1, 0.2], 25).scale(0.5)
     blob = {"peak": 3.0, "width": 0.35, "extent": 2.5, "radiance": mi.ScalarVector3f(GLOW)}
     return scene_of(
-        paths(**{"max_depth": 5, "rr_depth": 50, "emitter_candidates": 1, **options}),
+        paths(**{**FIXED, **options}),
         floor=floor(),
         mirror={**wall(2.2, half=2.0), "bsdf": tinted},
         glass={**ball, "center": [0.9, -0.6, -0.4], "bsdf": glass},
