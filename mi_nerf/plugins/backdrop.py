@@ -168,13 +168,7 @@ class Surfaces(Backdrop):
         return light
 
     def backward(
-        self,
-        ray: Any,
-        sampler: Any,
-        light: Light,
-        gradients: list[Any],
-        active: Any = True,
-        medium: Any = None,
+        self, ray: Any, sampler: Any, light: Light, gradients: list[Any], active: Any = True
     ) -> None:
         if not self._differentiable():
             return
@@ -185,16 +179,12 @@ class Surfaces(Backdrop):
                 self._sample(dr.ADMode.Backward, ray, sampler, active, pull, state)
             else:
                 with dr.resume_grad(), _differentiable_loops():
-                    radiance, *_ = self._sample(
-                        dr.ADMode.Backward, ray, sampler, active, medium=medium
-                    )
+                    radiance, *_ = self._sample(dr.ADMode.Backward, ray, sampler, active)
                     _backward(list(radiance), list(pull))
             sampler.schedule_state()
             dr.eval()
 
-    def forward(
-        self, ray: Any, sampler: Any, light: Light, active: Any = True, medium: Any = None
-    ) -> list[Any]:
+    def forward(self, ray: Any, sampler: Any, light: Light, active: Any = True) -> list[Any]:
         total = dr.zeros(Spectrum, dr.width(ray))
         if not self._differentiable():
             return list(total)
@@ -209,9 +199,7 @@ class Surfaces(Backdrop):
                 total += self._sample(dr.ADMode.Forward, ray, sampler, active, None, state)[0]
             else:
                 with dr.resume_grad(), _differentiable_loops():
-                    radiance, *_ = self._sample(
-                        dr.ADMode.Forward, ray, sampler, active, medium=medium
-                    )
+                    radiance, *_ = self._sample(dr.ADMode.Forward, ray, sampler, active)
                     total += Spectrum(*_forward(list(radiance)))
             sampler.schedule_state()
             dr.eval(total)

@@ -151,7 +151,7 @@ class FogScene:
         if not dr.any(there):
             return None
         ray = mi.Ray3f(camera.ray)
-        gap = Gap(fog.start, dr.select(there, fog.end, fog.start), there, ray, fog.medium)
+        gap = Gap(fog.start, dr.select(there, fog.end, fog.start), there, ray)
         seen = see(self._fields, _rays(camera, gap), normals=self._normals)
         active = there & (seen.opacity > 0)
         if not dr.any(active):
@@ -173,14 +173,8 @@ class FogScene:
         for part in traced.parts:
             count = len(part.outputs)
             own, gradients = gradients[:count], gradients[count:]
-            self._surfaces.backward(
-                part.gap.ray,
-                camera.sampler,
-                part.light,
-                own[5 : 5 + CHANNELS],
-                part.active,
-                medium=part.gap.medium,
-            )
+            ray, sampler = part.gap.ray, camera.sampler
+            self._surfaces.backward(ray, sampler, part.light, own[5 : 5 + CHANNELS], part.active)
             if part.passed is not None:
                 part.passed.backward(own[5 + CHANNELS :])
             pull_back(self._fields, _rays(camera, part.gap), own[:5])
@@ -191,8 +185,8 @@ class FogScene:
         camera, slopes = traced.camera, []
         for part in traced.parts:
             slopes += push_forward(self._fields, _rays(camera, part.gap))
-            ray, sampler, medium = part.gap.ray, camera.sampler, part.gap.medium
-            slopes += self._surfaces.forward(ray, sampler, part.light, part.active, medium=medium)
+            ray, sampler = part.gap.ray, camera.sampler
+            slopes += self._surfaces.forward(ray, sampler, part.light, part.active)
             if part.passed is not None:
                 slopes += part.passed.forward()
         return slopes

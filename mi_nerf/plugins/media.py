@@ -27,7 +27,6 @@ class Gap:
     end: Any  # of a medium, of a surface, or infinite; the start where a ray has no such gap
     there: Any  # whether it has
     ray: Any  # from where what is behind the fields counts: the start, or their place in a medium
-    medium: Any = None  # in which that is, of each ray
 
 
 @dataclass(frozen=True)
