@@ -15,6 +15,7 @@ Layout convention used throughout the package:
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Any, TypeAlias
 
 import drjit as dr
@@ -96,3 +97,19 @@ def gather_vector3(source: Vectors, index: Indices) -> Vectors:
     """Gathers the three components of ``source`` at ``index``, as an ``Array3``."""
     float_type = type(source[0])
     return vector3_type(float_type)(*(dr.gather(float_type, source[i], index) for i in range(3)))
+
+
+def joined(kind: Any, parts: Sequence[Any]) -> Any:
+    """Arrays of a kind, vectors too, one after the other, evaluated.
+
+    ``dr.concat`` would compile kernels for their lengths.
+    """
+    uint = dr.uint32_array_t(kind if dr.depth_v(kind) == 1 else dr.value_t(kind))
+    total, start = dr.zeros(kind, sum(map(dr.width, parts))), 0
+    dr.make_opaque(total)
+    for part in parts:
+        count = dr.width(part)
+        dr.scatter(total, part, dr.arange(uint, count) + dr.opaque(uint, start))
+        start += count
+    dr.eval(total)
+    return total

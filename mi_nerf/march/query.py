@@ -9,7 +9,7 @@ from typing import Any
 
 import drjit as dr
 
-from ..base.arrays import Floats, Indices, Mask, gather_vector3
+from ..base.arrays import Floats, Indices, Mask, gather_vector3, joined
 from ..base.kernel_stages import stage
 from ..fields.protocol import Field
 from .blocks import blocks
@@ -73,7 +73,7 @@ class Evaluation:
             self._evaluate(samples.index, keep)
             return
         rounds = [self._evaluate(index, keep) for index in self._front_to_back(stop)]
-        self.asked = _joined(rounds, type(samples.index))
+        self.asked = joined(type(samples.index), rounds)
 
     def _evaluate(self, index: Indices, keep: bool) -> Indices:
         """Fills in the samples ``index``, and returns it."""
@@ -215,18 +215,6 @@ def _private_sums() -> Iterator[None]:
         yield
     finally:
         dr.set_expand_threshold(before)
-
-
-def _joined(parts: list[Any], uint: Any) -> Any:
-    """One array after the other; ``dr.concat`` would compile kernels for their lengths."""
-    total = dr.zeros(uint, sum(len(part) for part in parts))
-    dr.make_opaque(total)
-    start = 0
-    for part in parts:
-        dr.scatter(total, part, dr.arange(uint, len(part)) + dr.opaque(uint, start))
-        start += len(part)
-    dr.eval(total)
-    return total
 
 
 def _spans(ray: Indices, rays: int) -> tuple[Indices, Indices]:

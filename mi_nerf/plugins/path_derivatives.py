@@ -15,6 +15,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ..base.arrays import joined
 from .colors import Spectrum, emission, emission_adjoint
 from .crossing import Crossing, crossings
 from .integral import Integral, chunks
@@ -204,18 +205,11 @@ class _Queue:
 
 
 def _joined(values: Sequence[Any]) -> Any:
-    """Arrays, or rays, one after the other; ``dr.concat`` would compile kernels for lengths."""
+    """Arrays, or rays, one after the other."""
     first = values[0]
     if len(values) == 1 or first is None or not dr.width(first):  # rgb has no wavelengths
         return first
     if isinstance(first, Rays):
         parts = {f.name: [getattr(value, f.name) for value in values] for f in fields(Rays)}
         return Rays(**{name: _joined(part) for name, part in parts.items()})
-    total, start = dr.zeros(type(first), sum(map(dr.width, values))), 0
-    dr.make_opaque(total)
-    for value in values:
-        count = dr.width(value)
-        dr.scatter(total, value, dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, start))
-        start += count
-    dr.eval(total)
-    return total
+    return joined(type(first), values)
