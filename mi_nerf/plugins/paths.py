@@ -92,12 +92,14 @@ class PathsBehind(Backdrop):
 
     def shade(self, hit: PathHit, ray: Any, sampler: Any, opacity: Any) -> Light:
         """The radiance from there on, on average over paths."""
-        settings, total, states = self._settings, Image(dr.width(hit.distance)), []
+        settings, rays, states = self._settings, dr.width(hit.distance), list[Followed]()
+        total = Image(rays)
         sampler = sampler.clone()
         going = dr.compress(1 - opacity > settings.stop) if settings.max_depth else mi.UInt32()
+        colors = Colors(self._around) if settings.keep else None
         for _ in range(settings.paths):
             slot = mi.UInt32(going)
-            image = self._recording(dr.width(hit.distance))
+            image = Image(rays) if colors is None else Recording(rays, settings.paths, colors)
             self._follow(hit.ends, slot, sampler, image)
             total.radiance += image.radiance
             total.alpha += image.alpha
@@ -107,7 +109,7 @@ class PathsBehind(Backdrop):
         radiance = list(total.radiance * (1 / settings.paths))
         valid = dr.fmin(total.alpha * (1 / settings.paths), 1)
         if not settings.hide_lights and self._scene.environment() is not None:
-            valid = dr.full(mi.Float, 1, dr.width(hit.distance))  # as in Mitsuba's path tracer
+            valid = dr.full(mi.Float, 1, rays)  # as in Mitsuba's path tracer
         dr.eval(radiance, valid)
         return Light(radiance, valid, states)
 
@@ -121,12 +123,6 @@ class PathsBehind(Backdrop):
         push = Push(self._fields, len(light.valid))
         self._replay(sampler, light, push)
         return list(push.tangent * (1 / self._settings.paths))
-
-    def _recording(self, rays: int) -> Image:
-        """For what one path for each of R rays brings."""
-        if not self._settings.keep:
-            return Image(rays)
-        return Recording(rays, self._settings.paths, Colors(self._around))
 
     def _replay(self, sampler: Any, light: Light, derivatives: Derivatives) -> None:
         """Follows the paths that :meth:`shade` has followed, with the same random numbers."""
