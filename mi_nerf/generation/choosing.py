@@ -10,7 +10,7 @@ scene, they then are inside.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -129,7 +129,7 @@ def _around(name: str, here: Situation, size: tuple[int, int], counts: dict[str,
         )
     seen = percent(found.survey.coverage)
     warning = f"warning: {reason}; {seen} of the pixels see the object"
-    return _surveyed(name, here, chosen, here.subject, warning, hide=here.hidden)
+    return replace(found, notes=(warning,))
 
 
 def _surveyed(

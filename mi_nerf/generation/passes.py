@@ -101,18 +101,18 @@ def sets(samples: int, pixels: int, sampler: Any, limit: int | None = None) -> l
     size = _largest_set(max(1, limit // pixels), sampler)
     count = math.ceil(samples / size)
     even = math.ceil(samples / count)
-    return [even if _taken(even, sampler) == even else size] * count
+    return [even if taken(even, sampler) == even else size] * count
 
 
 def _largest_set(most: int, sampler: Any) -> int:
     """The largest number of samples up to ``most`` that a sampler takes, or its smallest."""
     for wanted in range(most, 0, -1):
-        if _taken(wanted, sampler) == wanted:
+        if taken(wanted, sampler) == wanted:
             return wanted
-    return _taken(1, sampler)
+    return taken(1, sampler)
 
 
-def _taken(count: int, sampler: Any) -> int:
+def taken(count: int, sampler: Any) -> int:
     """The number of samples that a sampler makes of ``count``."""
     sampler.set_sample_count(count)
     return int(sampler.sample_count())

@@ -14,6 +14,7 @@ from ..scene_xml.scene_file import Bounds, SceneFile
 from ..scene_xml.sensors import named_ups
 from .choosing import Choice, Situation, choose, protocol_name
 from .emitters import Hidden
+from .passes import taken
 from .plan import Plan, halves
 from .protocol import Options
 from .sensors import SensorCamera, read_sensors
@@ -42,7 +43,6 @@ def make_plan(
     Raises:
         InputError: for options that make no sense, alone or for this scene.
     """
-    protocol_name(file, options)  # is known
     spp, about_samples = _samples(file, scene, options)
     sensors = read_sensors(scene) if file.plugins("Sensor") else []
     parts = with_kept(read_parts(file), scene, hidden)
@@ -197,18 +197,17 @@ def _samples(file: SceneFile, scene: Any, options: Options) -> tuple[int, list[s
         raise InputError(
             "{}: expected at least 2, of which the noise is estimated", Option("spp", wanted)
         )
-    if sampler is None or (spp := _taken(sampler, wanted)) == wanted:
+    if sampler is None or (spp := _divisible(sampler, wanted)) == wanted:
         return wanted, []
     kind = sampler.class_name()
     return spp, [f"{spp} samples a pixel: the scene's sampler {kind} cannot take half of {wanted}"]
 
 
-def _taken(sampler: Any, spp: int) -> int:
+def _divisible(sampler: Any, spp: int) -> int:
     """So many samples, or some more where a sampler cannot take half of them."""
     for half in halves(spp):
-        sampler.set_sample_count(half)
-        if half > 0 and sampler.sample_count() != half:
-            return 2 * int(sampler.sample_count())
+        if half > 0 and (found := taken(half, sampler)) != half:
+            return 2 * found
     return spp
 
 

@@ -28,6 +28,7 @@ from ..scene_xml.parts import box_of, read_parts
 from ..scene_xml.scene_file import Bounds, SceneFile, visible_bounds
 from ..scene_xml.scene_file import quiet as _quiet
 from ..scene_xml.sensors import separate_sensors
+from ..scene_xml.substitutes import REPLACEABLE
 from .emitters import ALL, Hidden
 from .hints import with_hints
 from .integrators import color_integrator, is_adjoint, require_choice
@@ -229,7 +230,7 @@ def _plan(file: SceneFile, options: Options) -> tuple[_Loaded, Plan]:
 
 def _load(file: SceneFile, options: Options, hide: bool) -> _Loaded:
     """Loads a scene whose light sources are hidden, but for those that are kept."""
-    file.substitute("Film", "Integrator", "ReconstructionFilter", "Sampler", "Sensor")
+    file.substitute(*REPLACEABLE)
     file.complete()
     for properties in file.plugins("Integrator"):
         if hide:

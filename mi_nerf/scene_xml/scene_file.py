@@ -44,6 +44,7 @@ class SceneFile:
         self.path = Path(path)
         self.parameters = dict(parameters or {})
         self.notes: list[str] = []
+        self._defaults: dict[str, str | None] = {}  # as far as anybody has asked
         check_file(self.path)
         self._absolute = Path(os.path.abspath(self.path))
         # Beside the file, or beside what it is a link to; then what its <path>s add.
@@ -63,10 +64,16 @@ class SceneFile:
 
     def default(self, name: str) -> str | None:
         """The value of a ``$parameter``: as given, or by the file's own ``<default>``."""
-        import mitsuba as mi
-
         if name in self.parameters:
             return self.parameters[name]
+        if name not in self._defaults:
+            self._defaults[name] = self._default(name)
+        return self._defaults[name]
+
+    def _default(self, name: str) -> str | None:
+        """What the file itself says, which takes parsing it."""
+        import mitsuba as mi
+
         # Mitsuba's parser takes much that is no XML, and does not tell defaults: it is asked what
         # it puts for the parameter in a scene that includes the file. The first default counts.
         file = quoteattr(str(self._absolute).replace("$", "\\$"))

@@ -21,6 +21,7 @@ _STAND_INS = {
     "Sensor": "perspective",
     "Integrator": "path",
 }
+REPLACEABLE = tuple(_STAND_INS)  # kinds that a dataset does not depend on, or brings its own of
 
 # Ways to the same picture that a path tracer finds as well, in Mitsuba 0.4 to 0.6.
 _TRANSPORT = frozenset(

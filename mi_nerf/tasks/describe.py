@@ -17,6 +17,7 @@ from ..fields.hash_grid import HashGridConfig
 from ..formats.field_file import FieldFile, load_field
 from ..generation.run import RECORD, ceilings
 from ..scene_xml.scene_file import SceneFile, quiet, visible_bounds
+from ..scene_xml.substitutes import REPLACEABLE
 from ..training.auto import Decision
 from ..training.checkpoint import read_checkpoint
 from ..training.run_folder import CHECKPOINT, CONFIG, FIELD, read_record
@@ -170,7 +171,7 @@ def _scene(path: Path) -> str:
     """A Mitsuba scene, as ``generate`` would take it."""
     with using_variant(choose_variant()), quiet():
         file = SceneFile(path)
-        file.substitute("Film", "Integrator", "ReconstructionFilter", "Sampler", "Sensor")
+        file.substitute(*REPLACEABLE)
         scene = file.load()
         box = visible_bounds(scene)
         sensors = Counter(_sensor(sensor) for sensor in scene.sensors())
