@@ -193,6 +193,17 @@ def project(
     return np.stack([x, y], axis=-1), depth
 
 
+def film_directions(x: ArrayLike, y: ArrayLike, intrinsics: Intrinsics) -> NDArray[np.float64]:
+    """Which ways a camera sees points of its film: vectors in its space, (..., 3), of any length.
+
+    Args:
+        x, y: Pixel coordinates; the camera looks along −z (OpenGL axes).
+    """
+    right = (np.asarray(x, np.float64) - intrinsics.cx) / intrinsics.fx
+    up = (intrinsics.cy - np.asarray(y, np.float64)) / intrinsics.fy
+    return np.stack([right, up, -np.ones_like(right)], axis=-1)
+
+
 # ---- Mitsuba -----------------------------------------------------------------
 
 

@@ -11,7 +11,7 @@ import drjit as dr
 import numpy as np
 
 from ..base.arrays import Mask
-from ..cameras.pinhole import Intrinsics
+from ..cameras.pinhole import Intrinsics, film_directions
 
 Array = np.ndarray[Any, Any]
 Hides = bool | Callable[[Any], Mask]  # which light sources are not seen
@@ -81,8 +81,7 @@ def camera_rays(
     steps = (np.arange(grid) + 0.5) / grid
     for pose, camera in zip(poses, intrinsics, strict=True):
         y, x = np.meshgrid(steps * camera.height, steps * camera.width, indexing="ij")
-        local = [(x - camera.cx) / camera.fx, (camera.cy - y) / camera.fy, -np.ones_like(x)]
-        d = np.stack(local, -1).reshape(-1, 3) @ np.asarray(pose)[:3, :3].T
+        d = film_directions(x, y, camera).reshape(-1, 3) @ np.asarray(pose)[:3, :3].T
         directions.append(d / np.linalg.norm(d, axis=-1, keepdims=True))
         origins.append(np.broadcast_to(np.asarray(pose)[:3, 3], d.shape))
     return np.array(origins), np.array(directions)

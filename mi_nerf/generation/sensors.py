@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.box import corners
 from ..base.errors import InputError, Option
 from ..cameras.pinhole import Intrinsics, project, sensor_dict
 from ..cameras.poses import opengl_from_mitsuba
@@ -41,12 +42,11 @@ class SensorCamera:
 
     def share_of_frame(self, lower: Array, upper: Array) -> float | None:
         """How much of the picture's smaller side a box spans; None where it is not in view."""
-        corners = np.stack(np.meshgrid(*np.stack([lower, upper], 1), indexing="ij"), -1)
         size = np.array([self.intrinsics.width, self.intrinsics.height])
         middle, depth = project((lower + upper) / 2, self.intrinsics, self.pose)
         if depth <= 0 or (middle < 0).any() or (middle > size).any():
             return None
-        ends, depths = project(corners.reshape(-1, 3), self.intrinsics, self.pose)
+        ends, depths = project(corners(lower, upper), self.intrinsics, self.pose)
         if (depths <= 0).any():
             return 1.0  # so near that it surrounds the camera
         return float(np.ptp(ends, axis=0).max() / size.min())

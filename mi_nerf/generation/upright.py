@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from ..base.box import corners
 from ..base.errors import InputError, Option
 from ..scene_xml.parts import Part
 from .sensors import SensorCamera
@@ -128,21 +129,16 @@ def _bases(parts: Sequence[Part]) -> list[tuple[Part, Array]]:
 def _side(base: Part, others: Sequence[Part]) -> Array | None:
     """The base's normal if all others are on that side of it, and near."""
     normal = np.asarray(base.normal)
-    corners = np.concatenate([_corners(part) for part in others])
-    size = float(np.ptp(corners, axis=0).max())
+    points = np.concatenate([corners(part.lower, part.upper) for part in others])
+    size = float(np.ptp(points, axis=0).max())
     # Boxes reach further across than what is in them.
     below = 0.05 if _is_axis(normal) else 0.25
     for sign in (1.0, -1.0):
-        heights = sign * (corners @ normal)
+        heights = sign * (points @ normal)
         top = max(sign * level for level in base.levels)
         if -below * size <= float(heights.min()) - top <= _GAP * size:
             return sign * normal
     return None
-
-
-def _corners(part: Part) -> Array:
-    ends = np.stack([part.lower, part.upper], axis=1)
-    return np.stack(np.meshgrid(*ends, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _is_axis(direction: Array) -> bool:

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..base.arrays import upload
-from ..base.box import Corner
+from ..base.box import Corner, corners
 from ..march.intervals import box_interval
 from .placement import Matrix, PlacedField
 from .sampled import SampledField
@@ -119,9 +119,9 @@ class FieldBox:
     def bounds(self) -> tuple[list[float], float]:
         """Its centre and half its diagonal, in the world."""
         matrix = self.from_unit()
-        corners = np.indices((2, 2, 2)).reshape(3, 8).T @ matrix[:3, :3].T + matrix[:3, 3]
-        center = corners.mean(axis=0)
-        return center.tolist(), float(np.linalg.norm(corners - center, axis=1).max())
+        points = corners(np.zeros(3), np.ones(3)) @ matrix[:3, :3].T + matrix[:3, 3]
+        center = points.mean(axis=0)
+        return center.tolist(), float(np.linalg.norm(points - center, axis=1).max())
 
     def surface(self) -> float:
         """Its area in the world."""

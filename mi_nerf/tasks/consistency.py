@@ -19,7 +19,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..base.arrays import Image
-from ..cameras.pinhole import Intrinsics, project
+from ..cameras.pinhole import Intrinsics, film_directions, project
 from ..data.surfaces import Surfaces
 
 MOST_VIEWS = 64  # that are compared, evenly spread: their pictures are kept
@@ -92,16 +92,8 @@ def points_seen(points: Image, surfaces: Surfaces, pose: Image) -> Image:
 
 def _points(surfaces: Surfaces, pose: Image) -> Image:
     """Some of the world-space points that a view sees well, (N, 3)."""
-    camera = surfaces.camera
     row, column = np.nonzero(surfaces.depth > 0)
-    local = np.stack(
-        [
-            (column + 0.5 - camera.cx) / camera.fx,
-            (camera.cy - row - 0.5) / camera.fy,
-            np.full(len(row), -1.0),
-        ],
-        axis=-1,
-    )
+    local = film_directions(column + 0.5, row + 0.5, surfaces.camera)
     rays = local / np.linalg.norm(local, axis=-1, keepdims=True)
     points = pose[:3, 3] + (rays * surfaces.depth[row, column][:, None]) @ pose[:3, :3].T
     points = points[points_seen(points, surfaces, pose)]  # not at silhouettes
