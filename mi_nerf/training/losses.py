@@ -8,11 +8,12 @@ import drjit as dr
 
 from ..base.color import linear_to_srgb
 from ..march.quadrature import over_background
+from .config import TrainConfig
 
 if TYPE_CHECKING:
     from .batches import RayBatch
 
-RELATIVE_FLOOR = 1e-3  # radiance below which the relative loss is absolute
+RELATIVE_FLOOR = TrainConfig.loss_floor  # where a caller has no other
 # Of opacity beside relative errors. With 1, silhouettes are blurred, with 100, colours suffer:
 # docs/datasets.md has the figures.
 ALPHA_WEIGHT = 10.0
