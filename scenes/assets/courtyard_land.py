@@ -9,21 +9,11 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from geometry import Array, grid_faces, output_folder, write_ply
+from geometry import Array, grid_faces, output_folder, waves, write_ply
 from solids import Solid, arc, box, fragment, merge, moved, step, wedge
 from surfaces import leaves, put_mesh, scale, slab, tuft, turn, write_solid
 
 put = partial(put_mesh, "courtyard")
-
-
-def waves(x: Array, y: Array, seed: int) -> Array:
-    """Smooth noise, mostly from -1 to 1, over a plane that does not repeat."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros(np.broadcast(x, y).shape)
-    for _ in range(7):
-        angle, phase = rng.uniform(0, 2 * np.pi, 2)
-        total += np.sin(np.cos(angle) * x + np.sin(angle) * y + phase)
-    return total / 4
 
 
 HILLS = [  # azimuth from the north, distance, height, width

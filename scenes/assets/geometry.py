@@ -18,6 +18,16 @@ import numpy as np
 Array = np.ndarray[Any, Any]
 
 
+def waves(x: Array, y: Array, seed: int) -> Array:
+    """Smooth noise, mostly from -1 to 1, over a plane that does not repeat: waves of all ways."""
+    rng = np.random.default_rng(seed)
+    total = np.zeros(np.broadcast(x, y).shape)
+    for _ in range(7):
+        angle, phase = rng.uniform(0, 2 * np.pi, 2)
+        total += np.sin(np.cos(angle) * x + np.sin(angle) * y + phase)
+    return total / 4
+
+
 def output_folder() -> Path:
     """Where the script writes: its first argument, or beside itself."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from geometry import Array, output_folder, write_ply
+from geometry import Array, output_folder, waves, write_ply
 from PIL import Image
 from solids import Solid, extrude, fragment, merge, mesh, moved, step, wedge
 
@@ -11,23 +11,13 @@ EYE = -0.95  # The y of the camera
 LAKE = -0.475  # The height of the water
 
 
-def noise(x: Array, y: Array, seed: int) -> Array:
-    """Smooth noise, mostly from -1 to 1: waves in random directions."""
-    rng = np.random.default_rng(seed)
-    total = np.zeros(np.broadcast(x, y).shape)
-    for _ in range(7):
-        angle, phase = rng.uniform(0, 2 * np.pi, 2)
-        total += np.sin(np.cos(angle) * x + np.sin(angle) * y + phase)
-    return total / 4
-
-
 def ground_height(x: Array, y: Array) -> Array:
     """Height of the meadow: a slope down to the lake, with rising sides."""
     far = np.clip((y - EYE) / 1.4, 0, 1)
     height = -0.3 - 0.24 * np.sin(np.pi * np.clip(far * 1.15, 0, 1) * 0.5) ** 1.2
     height = height + 0.42 * far**0.7 * np.abs(x - 0.06) ** 1.8 * np.where(x < 0, 1.15, 0.8)
-    height = height + (0.004 + 0.02 * far) * noise(6 * x, 6 * y, 3)
-    return height + 0.004 * noise(19 * x, 19 * y, 4)
+    height = height + (0.004 + 0.02 * far) * waves(6 * x, 6 * y, 3)
+    return height + 0.004 * waves(19 * x, 19 * y, 4)
 
 
 def grid(columns: Array, rows: Array) -> Array:
@@ -57,11 +47,11 @@ def ridge(number: int) -> tuple[Array, Array, Array]:
     seed, size = 20 + 7 * number, top - low
     x = np.linspace(-0.99, 0.99, 56)
     v = np.array([0.0, 0.3, 0.6, 0.82, 1.0])[:, None]
-    crest = top + 0.3 * size * noise(4.2 * x, 0 * x, seed)
-    crest = crest + 0.12 * size * noise(14 * x, 0 * x, seed + 1)
-    crest = crest + 0.055 * size * noise(39 * x, 0 * x, seed + 2)
+    crest = top + 0.3 * size * waves(4.2 * x, 0 * x, seed)
+    crest = crest + 0.12 * size * waves(14 * x, 0 * x, seed + 1)
+    crest = crest + 0.055 * size * waves(39 * x, 0 * x, seed + 2)
     crest = crest + (0.3, 0.3, 0.24)[number] * size * (np.abs(x + 0.08 * (number - 1)) - 0.45)
-    gully = noise(15 * x, 3 * v, seed + 3) + 0.5 * noise(31 * x, 5 * v, seed + 5)
+    gully = waves(15 * x, 3 * v, seed + 3) + 0.5 * waves(31 * x, 5 * v, seed + 5)
     z = crest * v + low * (1 - v)
     depth = y - 0.14 * (1 - v) + 0.022 * gully * np.sqrt(1 - v) * (0.3 + v)
     points = np.stack([np.broadcast_to(x, z.shape), depth, z], -1).reshape(-1, 3)
@@ -141,7 +131,7 @@ def boulder() -> tuple[Array, Array]:
     """A stone of radius about 1, faceted."""
     rows, columns = np.linspace(0, np.pi, 6), np.linspace(0, 2 * np.pi, 9)
     angle, fall = columns[None], rows[:, None]
-    radius = 1 + 0.16 * noise(3 * np.cos(angle), 3 * np.sin(angle) + 4 * np.cos(fall), 8)
+    radius = 1 + 0.16 * waves(3 * np.cos(angle), 3 * np.sin(angle) + 4 * np.cos(fall), 8)
     out = [np.sin(fall) * np.cos(angle), np.sin(fall) * np.sin(angle), np.cos(fall) + 0 * angle]
     points = (np.stack(out, -1) * radius[..., None]).reshape(-1, 3)
     return points, grid(columns, rows)[:, ::-1]
@@ -201,7 +191,7 @@ def forest(rng: np.random.Generator) -> list[str]:
         y = EYE + rng.uniform(0.62, 1.42)
         x = rng.uniform(-1, 1) * min(0.6 * (y - EYE) + 0.06, 0.95)
         z = float(ground_height(np.array(x), np.array(y)))
-        clear = abs(x - 0.02) < 0.33 + 0.1 * float(noise(np.array(5 * x), np.array(5 * y), 9))
+        clear = abs(x - 0.02) < 0.33 + 0.1 * float(waves(np.array(5 * x), np.array(5 * y), 9))
         if clear or z < LAKE + 0.02:
             continue
         size = round(rng.uniform(0.085, 0.15), 3)
