@@ -107,7 +107,7 @@ def joined(kind: Any, parts: Sequence[Any]) -> Any:
     uint = dr.uint32_array_t(kind if dr.depth_v(kind) == 1 else dr.value_t(kind))
     total, start = dr.zeros(kind, sum(map(dr.width, parts))), 0
     dr.make_opaque(total)
-    for part in parts:
+    for part in filter(dr.width, parts):  # Dr.Jit adds nothing to an empty array
         count = dr.width(part)
         dr.scatter(total, part, dr.arange(uint, count) + dr.opaque(uint, start))
         start += count

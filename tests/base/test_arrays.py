@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import drjit as dr
 import numpy as np
 import pytest
 
-from mi_nerf.base.arrays import upload
+from mi_nerf.base.arrays import joined, upload, vector3_type
 
 NUMBERS = [0.0, -0.0, 1.5, -2e-38, 3e38, np.inf, -np.inf]
 
@@ -35,3 +36,17 @@ def test_it_is_a_copy(ad: Any) -> None:
     array = upload(ad.Float, values)
     values[:] = 7
     assert np.array(array)[2] == 1.5
+
+
+@pytest.mark.parametrize("lengths", [[], [3], [0, 2, 0, 5], [4, 1]])
+def test_arrays_and_vectors_one_after_the_other(ad: Any, lengths: list[int]) -> None:
+    rng = np.random.default_rng(0)
+    parts = [rng.random((3, n)).astype(np.float32) for n in lengths]
+    whole = np.concatenate(parts, axis=1) if parts else np.empty((3, 0))
+    numbers = joined(ad.Float, [ad.Float(part[0]) for part in parts])
+    assert np.array_equal(np.array(numbers), whole[0])
+    vector = vector3_type(ad.Float)
+    vectors = joined(vector, [vector(*(ad.Float(x) for x in part)) for part in parts])
+    assert [np.array(x).tolist() for x in vectors] == whole.tolist()
+    index = joined(ad.UInt32, [dr.arange(ad.UInt32, n) for n in lengths])
+    assert np.array(index).tolist() == [i for n in lengths for i in range(n)]

@@ -13,7 +13,14 @@ from hypothesis import strategies as st
 
 from mi_nerf.base.errors import InputError
 from mi_nerf.cameras import poses as cameras
-from mi_nerf.cameras.pinhole import Intrinsics, pack_poses, pixel_rays, project, sensor_dict
+from mi_nerf.cameras.pinhole import (
+    Intrinsics,
+    film_directions,
+    pack_poses,
+    pixel_rays,
+    project,
+    sensor_dict,
+)
 from mi_nerf.cameras.poses import look_at
 from tests.support.datasets import orbit_poses
 
@@ -355,3 +362,13 @@ def test_sensor_dict_settings(mi: Any) -> None:
 def test_sensor_dict_wants_square_pixels(mi: Any) -> None:
     with pytest.raises(InputError, match=r"fx = 20 and fy = 33"):
         sensor_dict(STRETCHED, np.eye(4))
+
+
+def test_film_directions_invert_projection() -> None:
+    camera = Intrinsics(40, 30, 51.0, 47.0, 18.5, 16.0)
+    x, y = np.random.default_rng(0).uniform(0, 40, (2, 50))
+    directions = film_directions(x, y, camera)
+    assert (directions[:, 2] == -1).all()
+    found, depth = project(3 * directions, camera, np.eye(4))
+    np.testing.assert_allclose(found, np.stack([x, y], axis=1), rtol=1e-12)
+    np.testing.assert_allclose(depth, 3)
